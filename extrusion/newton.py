@@ -1,0 +1,128 @@
+"""Newton's method for one increment: SNES with absolute residuals in newtons, MUMPS, and a safeguarded step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from petsc4py import PETSc
+
+import numpy as np
+
+from extrusion.problem import Problem
+
+REASONS = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one nonlinear solve did."""
+
+    converged: bool
+    iterations: int  # linear solves
+    residual: float  # N
+    reason: str
+
+
+class Newton:
+    """SNES on all unknowns of a problem.
+
+    Each step is the best of 1, 1/2, 1/4 of the Newton update in the residual's norm. The tangent takes the second
+    variation of the gap (rotation of the die's facets, moving split points) once updates are small: it is indefinite
+    at the die's corners, and from far away it misleads (CONTACT section 2).
+
+    Args:
+        problem: What is solved.
+        atol: Absolute tolerance of the residual, N; not below the round-off of the forces that cancel in it.
+        max_iterations: Linear solves before giving up.
+        near: Largest update (mm) after which the second variation is used.
+    """
+
+    def __init__(
+        self, problem: Problem, atol: float = 1e-6, max_iterations: int = 40, near: float | None = None
+    ) -> None:
+        self.problem, self.atol = problem, atol
+        self._max = max_iterations
+        self._near = 1e-3 * problem.case.profile.radius if near is None else near
+        self._update = np.inf
+        self._f = problem.x.duplicate()
+        self._trial = problem.x.duplicate()
+        self._trial_f = problem.x.duplicate()
+        self.A = problem.tangent_without_contact()
+        snes = PETSc.SNES().create(problem.comm)
+        snes.setOptionsPrefix("extrusion_")
+        snes.setType("newtonls")
+        snes.setFunction(lambda _, x, f: self._residual(x, f), self._f)
+        snes.setJacobian(self._tangent, self.A)
+        snes.setConvergenceTest(self._test)
+        snes.getLineSearch().setType("basic")
+        snes.setLineSearchPreCheck(self._shorten)
+        ksp = snes.getKSP()
+        ksp.setType("preonly")
+        pc = ksp.getPC()
+        pc.setType("lu")
+        pc.setFactorSolverType("mumps")
+        snes.setFromOptions()
+        self.snes = snes
+        self._known: tuple[int, PETSc.Vec] | None = None
+        self.history: list[float] = []
+
+    def _tangent(self, snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, _: PETSc.Mat) -> None:
+        """Hand SNES the tangent; where its pattern has grown it is a new matrix, which the linear solve then takes."""
+        A = self.problem.tangent(x, self._update < self._near)
+        if A != self.A:
+            self._last_A, self.A = self.A, A  # SNES still looks at the old one on its way out of this call
+            snes.setJacobian(self._tangent, A)
+
+    def _residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        if self._fresh:  # the line search has just evaluated it here
+            self._trial_f.copy(f)
+            self._fresh = False
+        else:
+            self.problem.residual(x, f)
+
+    _fresh = False
+
+    def _shorten(self, x: PETSc.Vec, y: PETSc.Vec, *_: object) -> bool:
+        """Scale the update y to the best of 1, 1/2, 1/4; SNES then takes x - y whole."""
+        before = self.history[-1]
+        best, norm = 0.0, np.inf
+        for factor in (1.0, 0.5, 0.25, 0.1, 0.02):  # the last two only where all before had no residual
+            self._trial.waxpy(-factor, y, x)
+            self.problem.residual(self._trial, self._trial_f)
+            found = float(self._trial_f.norm())
+            if found < norm:
+                best, norm = factor, found
+            if found < before:
+                break
+            if factor <= 0.25 and np.isfinite(norm):
+                break
+        if best == 0.0:
+            y.set(np.nan)
+        elif best != factor:
+            self._trial.waxpy(-best, y, x)
+            self.problem.residual(self._trial, self._trial_f)
+        if best not in (0.0, 1.0):
+            y.scale(best)
+        self._fresh = best > 0.0
+        self._update = self.problem.largest_displacement(y)
+        return best != 1.0
+
+    def _test(self, snes: PETSc.SNES, it: int, norms: tuple[float, float, float]) -> int:
+        norm = norms[2]
+        self.history.append(norm)
+        reason = PETSc.SNES.ConvergedReason
+        if not np.isfinite(norm):
+            return int(reason.DIVERGED_FNORM_NAN)
+        if norm <= self.tolerance:
+            return int(reason.CONVERGED_FNORM_ABS)
+        if it >= self._max:
+            return int(reason.DIVERGED_MAX_IT)
+        return int(reason.ITERATING)
+
+    def solve(self, x: PETSc.Vec) -> Outcome:
+        """Solve from x, in place; x already carries the supports' values."""
+        self.history, self._update, self._fresh = [], np.inf, False
+        self.tolerance = max(self.atol, self.problem.round_off(x))
+        self.snes.solve(None, x)
+        reason = self.snes.getConvergedReason()
+        return Outcome(reason > 0, self.snes.getIterationNumber(), self.history[-1], REASONS.get(reason, str(reason)))

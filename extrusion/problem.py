@@ -1,0 +1,479 @@
+"""Two bodies, their supports and their contact zones: residual, tangent and reports of one scene.
+
+The unknown x holds the displacement of both bodies in one Lagrange space (one mesh, two unconnected parts) and, at
+its end, on the last rank, the multipliers. The bulk stiffness K is constant; contact adds a few sparse rows that every
+rank computes whole from the gathered surfaces, and of which it keeps those it owns.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+
+import dolfinx.fem.petsc
+import ufl
+from dolfinx import fem
+
+from extrusion.cases import Case, Zone
+from extrusion.contact import stiffness
+from extrusion.elasticity import epsilon, quadrature_degree, sigma, virtual_work, von_mises
+from extrusion.errors import InputError
+from extrusion.gap import Array, Index, Surface, polyline
+from extrusion.mesh import PlainMesh, TaggedMesh, check_profile, distribute, on_root
+from extrusion.surfaces import Trace, all_ranks, gather_trace
+from extrusion.zones import ContactTerm, IntegratedContact, NodalContact, Pair, gap_at_nodes
+
+AXIS = {"r": 0, "y": 1}
+
+
+class Problem:
+    """One scene, discretised.
+
+    Args:
+        case: The scene.
+        mesh: Its mesh on rank 0 (None elsewhere).
+        comm: Ranks that share it.
+    """
+
+    def __init__(self, case: Case, mesh: PlainMesh | None, comm: MPI.Intracomm = MPI.COMM_WORLD) -> None:
+        self.case, self.comm = case, comm
+        on_root(comm, lambda: check_profile(mesh, case.profile) if mesh else None)
+        bodies = ("billet", "die") if case.die == "elastic" else ("billet",)
+        self.tagged: TaggedMesh = distribute(comm, mesh, bodies)
+        self.bodies = bodies
+        self.V = fem.functionspace(self.tagged.msh, ("Lagrange", case.order, (2,)))
+        self._materials = {"billet": case.billet, "die": case.die_material}
+        self._assemble_bulk()
+        self._find_supports()
+        self._gather_contact()
+        self._lay_out()
+
+    # -- bulk ------------------------------------------------------------------------------------------------
+
+    def _assemble_bulk(self) -> None:
+        msh, groups = self.tagged.msh, self.tagged.groups
+        degree = quadrature_degree(self.case.order, axisymmetric=True)
+        dx = ufl.Measure("dx", msh, subdomain_data=self.tagged.cell_tags, metadata={"quadrature_degree": degree})
+        u, v = ufl.TrialFunction(self.V), ufl.TestFunction(self.V)
+        form = 0
+        for body in self.bodies:
+            material = self._materials[body]
+            lmbda, mu = (fem.Constant(msh, float(value)) for value in (material.lmbda, material.mu))
+            form += virtual_work(u, v, lmbda, mu, dx(groups[body]), axisymmetric=True)
+        self.K = dolfinx.fem.petsc.assemble_matrix(fem.form(form))
+        self.K.assemble()
+
+    def stress_fields(self, x: PETSc.Vec) -> dict[str, fem.Function]:
+        """Displacement (mm) and von Mises stress (MPa, cell means on DG0) as DOLFINx functions."""
+        u = fem.Function(self.V, name="displacement")
+        u.x.array[: self._owned] = x.array_r[: self._owned]
+        u.x.scatter_forward()
+        msh, groups = self.tagged.msh, self.tagged.groups
+        DG0 = fem.functionspace(msh, ("DG", 0))
+        lame = {name: fem.Function(DG0) for name in ("lmbda", "mu")}
+        for body in self.bodies:
+            cells = self.tagged.cell_tags.find(groups[body])
+            for name, f in lame.items():
+                f.x.array[cells] = getattr(self._materials[body], name)
+        position = ufl.SpatialCoordinate(msh)
+        stress = sigma(epsilon(u, position, axisymmetric=True), lame["lmbda"], lame["mu"])
+        mises = fem.Function(DG0, name="von_mises")
+        mises.interpolate(fem.Expression(von_mises(stress), DG0.element.interpolation_points))
+        return {"displacement": u, "von_mises": mises}
+
+    # -- supports --------------------------------------------------------------------------------------------
+
+    def _dofs_on(self, group: str) -> np.ndarray:
+        """This rank's dof blocks (ghosts included) on a facet group; none where the mesh lacks it."""
+        number = self.tagged.groups.get(group)
+        if number is None:
+            return np.zeros(0, dtype=np.int32)
+        msh = self.tagged.msh
+        msh.topology.create_connectivity(1, 2)
+        return fem.locate_dofs_topological(self.V, 1, self.tagged.facet_tags.find(number))
+
+    def _find_supports(self) -> None:
+        rear, axis, clamped = (self._dofs_on(group) for group in ("rear", "axis", "fixed"))
+        on_die_axis = self._dofs_on("die_axis")
+        index_map = self.V.dofmap.index_map
+        self._owned = 2 * index_map.size_local
+
+        def own(blocks: np.ndarray, component: int) -> np.ndarray:
+            dofs = 2 * blocks.astype(np.int64) + component
+            return np.unique(dofs[dofs < self._owned])
+
+        self._driven = own(rear, 1)
+        self._clamped = np.concatenate([own(clamped, 0), own(clamped, 1)])
+        self._held = np.unique(np.concatenate([self._driven, self._clamped, own(axis, 0), own(on_die_axis, 0)]))
+        self._billet_y = own(self._blocks_of("billet"), 1)
+        if self.comm.allreduce(len(self._driven)) == 0:
+            raise InputError("mesh", "rear", "the group of the pushed face has no facets")
+
+    def _blocks_of(self, body: str) -> np.ndarray:
+        cells = self.tagged.cell_tags.find(self.tagged.groups[body])
+        return np.unique(self.V.dofmap.list[cells])
+
+    # -- contact ---------------------------------------------------------------------------------------------
+
+    def _gather_contact(self) -> None:
+        case, profile = self.case, self.case.profile
+        traces: dict[str, Trace] = {}
+        for zone in case.zones:
+            for group in (zone.billet, *((zone.die,) if case.die == "elastic" else ())):
+                facets = self.tagged.facet_tags.find(self.tagged.groups[group])
+                try:
+                    traces[group] = gather_trace(self.V, facets, 1 - AXIS[zone.ray])
+                except ValueError as error:
+                    raise InputError("mesh", group, str(error)) from None
+        needs_cells = {zone.billet if zone.slave == "billet" else zone.die for zone in case.zones}
+        if case.method != "nitsche":
+            needs_cells = set()
+        live = [trace.cell_nodes if g in needs_cells else trace.nodes for g, trace in traces.items()]
+        self._live = np.unique(np.concatenate([nodes.ravel() for nodes in live]))
+        n = len(self._live)
+        surfaces = {g: trace.surface(self._live, g in needs_cells) for g, trace in traces.items()}
+        if case.die == "rigid":
+            for zone in case.zones:
+                names = profile.bore if zone.die == "bore" else profile.cone
+                curve = profile.curve(names)
+                if case.method == "nodal":
+                    curve = _subdivide(curve, [profile.division(a, b) for a, b in pairwise(names)])
+                base, t = 1 - AXIS[zone.ray], curve[1] - curve[0]
+                side = float(np.sign(np.dot([t[1], -t[0]], profile.normals(names)[0])))
+                if curve[-1, base] < curve[0, base]:
+                    curve, side = curve[::-1], -side
+                surfaces[zone.die] = polyline(curve, n, side)
+                n += len(curve)
+        self._n_nodes = n
+        self.terms: list[ContactTerm] = []
+        first = 2 * n
+        for zone in case.zones:
+            term = self._term(zone, surfaces, first)
+            first += term.multipliers
+            self.terms.append(term)
+        self.n_multipliers = first - 2 * n
+
+    def _term(self, zone: Zone, surfaces: dict[str, Surface], first: int) -> ContactTerm:
+        case = self.case
+        slave, master = surfaces[zone.billet], surfaces[zone.die]
+        material, sign = case.billet, 1.0
+        if zone.slave == "die":
+            slave, master, material, sign = master, slave, case.die_material, -1.0
+        ray = (zone.gap or ("closest" if case.method == "nodal" else "ray")) == "ray"
+        extended = zone.contact != "bilateral" or len(case.zones) > 1
+        pair = Pair(zone.name, slave, master, AXIS[zone.ray], sign, zone.contact, ray, zone.smooth, extended)
+        k = stiffness(case.contact_gamma, material.E, material.nu, slave.length)
+        rest: tuple[float, bool] = (case.profile.radius, zone.initial == "interpenetrating")
+        if case.method == "nodal":
+            return NodalContact(pair, first, k, *rest)
+        return IntegratedContact(pair, k, material if case.method == "nitsche" else None, case.theta, *rest)
+
+    # -- layout of x, and of the contact vector z in it ------------------------------------------------------
+
+    def _lay_out(self) -> None:
+        comm, last = self.comm, self.comm.rank == self.comm.size - 1
+        index_map = self.V.dofmap.index_map
+        self.n_displacements = 2 * index_map.size_global
+        self.n = self.n_displacements + self.n_multipliers
+        self.n_local = self._owned + (self.n_multipliers if last else 0)
+        self.x = PETSc.Vec().createMPI((self.n_local, self.n), comm=comm)
+        self._row0 = self.x.owner_range[0]
+        self.n_z = 2 * self._n_nodes + self.n_multipliers
+        live = (2 * self._live[:, None] + np.arange(2)).ravel()
+        multipliers = self.n_displacements + np.arange(self.n_multipliers)
+        self._z_to_x = np.full(self.n_z, -1, dtype=np.int64)
+        self._z_to_x[: len(live)] = live
+        self._z_to_x[2 * self._n_nodes :] = multipliers
+        taken = np.concatenate([live, multipliers]).astype(PETSc.IntType)
+        self._z_live = np.flatnonzero(self._z_to_x >= 0)
+        source = PETSc.IS().createGeneral(taken, comm=PETSc.COMM_SELF)
+        self._z_vec = PETSc.Vec().createSeq(len(taken))
+        self._to_z = PETSc.Scatter().create(self.x, source, self._z_vec, None)
+        held = all_ranks(comm, self._held + self._row0)
+        self._z_held = np.isin(self._z_to_x, held)
+        mine = (self._z_to_x >= self._row0) & (self._z_to_x < self._row0 + self.n_local)
+        self._z_mine = np.flatnonzero(mine)
+        self._x_mine = self._z_to_x[self._z_mine] - self._row0
+        self._z_free = ~self._z_held & (self._z_to_x >= 0)
+        self._z_row = mine & self._z_free
+        indptr, indices, data = self.K.getValuesCSR()
+        self._K_wide = _widen(comm, self.n_local, self.n, indptr, indices, data)
+        self._K_size = _widen(comm, self.n_local, self.n, indptr, indices, np.abs(data))
+        self._tangent = TangentMatrix(comm, self.n_local, self.n, self._row0, indptr, indices, data, held)
+
+    def gather(self, x: PETSc.Vec) -> Array:
+        """The contact vector z of x, on every rank (collective)."""
+        self._to_z.scatter(x, self._z_vec, addv=False, mode="forward")
+        z = np.zeros(self.n_z)
+        z[self._z_live] = self._z_vec.array_r
+        return z
+
+    def drive(self, x: PETSc.Vec, t: float) -> None:
+        """Set the supports' values at rear displacement t, mm."""
+        values = x.array
+        values[self._held] = 0.0
+        values[self._driven] = t
+
+    def shift_billet(self, x: PETSc.Vec, dt: float) -> None:
+        """Move the whole billet along y by dt, mm."""
+        x.array[self._billet_y] += dt
+
+    # -- residual and tangent --------------------------------------------------------------------------------
+
+    def contact_forces(self, z: Array) -> Array:
+        """Contact's part of the residual over z, N (and multiplier rows)."""
+        R = np.zeros(self.n_z)
+        for term in self.terms:
+            term.add_residual(z, R)
+        return R
+
+    def forces(self, x: PETSc.Vec) -> PETSc.Vec:
+        """Out-of-balance force of all dofs, N: at the supports their reactions, elsewhere the residual."""
+        f = self._K_wide.createVecLeft()
+        self._K_wide.mult(x, f)
+        R = self.contact_forces(self.gather(x))
+        f.array[self._x_mine] += R[self._z_mine]
+        return f
+
+    def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        """Residual into f, N; zero rows at the supports, whose values x carries already."""
+        self._K_wide.mult(x, f)
+        try:
+            R = self.contact_forces(self.gather(x))
+        except ArithmeticError:
+            f.set(np.nan)
+            return
+        values = f.array
+        values[self._x_mine] += R[self._z_mine]
+        values[self._held] = 0.0
+
+    def tangent(self, x: PETSc.Vec, geometric: bool) -> PETSc.Mat:
+        """Derivative of the residual; a new matrix whenever its pattern has grown."""
+        z = self.gather(x)
+        parts = [term.tangent(z, geometric) for term in self.terms]
+        rows, cols, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+        keep = self._z_row[rows] & self._z_free[cols]
+        return self._tangent.fill(self._z_to_x[rows[keep]] - self._row0, self._z_to_x[cols[keep]], values[keep])
+
+    def largest_displacement(self, x: PETSc.Vec) -> float:
+        """Largest displacement component in x on any rank, multipliers left out."""
+        mine = float(np.max(np.abs(x.array_r[: self._owned]), initial=0.0))
+        return float(self.comm.allreduce(mine, op=MPI.MAX)) if self.comm.size > 1 else mine
+
+    def tangent_without_contact(self) -> PETSc.Mat:
+        """The bulk's tangent, with identity at the supports (and nothing yet for the multipliers)."""
+        none = np.zeros(0, dtype=np.int64)
+        return self._tangent.fill(none, none, np.zeros(0))
+
+    def round_off(self, x: PETSc.Vec) -> float:
+        """Norm of the round-off in the residual at x, N: machine epsilon times the forces |K| |u| that cancel in it."""
+        u, f = x.duplicate(), x.duplicate()
+        u.array[:] = np.abs(x.array_r)
+        u.array[self._owned :] = 0.0
+        self._K_size.mult(u, f)
+        norm = float(f.norm())
+        u.destroy()
+        f.destroy()
+        return float(np.finfo(float).eps) * norm
+
+    # -- reports ---------------------------------------------------------------------------------------------
+
+    def start(self, x: PETSc.Vec) -> None:
+        """Accepted contact state at t = 0."""
+        z = self.gather(x)
+        for term in self.terms:
+            term.start(z)
+
+    def pair_up(self, x: PETSc.Vec) -> None:
+        """Pair billet and die anew at x, for terms that freeze their pairing."""
+        z = self.gather(x)
+        for term in self.terms:
+            term.pair_up(z)
+
+    def accept(self, x: PETSc.Vec) -> None:
+        """Make x the accepted state of every zone."""
+        z = self.gather(x)
+        for term in self.terms:
+            term.accept(z)
+
+    def reactions(self, x: PETSc.Vec) -> tuple[float, float]:
+        """Axial force of the rear face on the billet, and of the die's supports on the die, N, whole revolution.
+
+        Both are positive in +y; they balance. A rigid die is its own support.
+        """
+        f = self.forces(x)
+        rear = float(f.array_r[self._driven].sum())
+        clamped_y = self._clamped[self._clamped % 2 == 1]
+        die = float(f.array_r[clamped_y].sum())
+        f.destroy()
+        rear, die = self.comm.allreduce(rear), self.comm.allreduce(die)
+        if self.case.die == "rigid":
+            R = self.contact_forces(self.gather(x))
+            first = 2 * len(self._live)
+            die = float(R[first + 1 : 2 * self._n_nodes : 2].sum())
+        return rear, die
+
+    def energy(self, x: PETSc.Vec) -> float:
+        """Elastic energy of both bodies, N mm, whole revolution."""
+        f = self._K_wide.createVecLeft()
+        self._K_wide.mult(x, f)
+        energy = 0.5 * float(x.dot(f))
+        f.destroy()
+        return energy
+
+    def named_points(self) -> dict[str, tuple[int, int]]:
+        """Rank and local dof block of each named point of the profile that is a node of the mesh."""
+        x = self.V.tabulate_dof_coordinates()[: self._owned // 2, :2]
+        blocks = self._blocks_of("billet")
+        billet = np.isin(np.arange(len(x)), blocks)
+        out = {}
+        for name, point in self.case.profile.points.items():
+            in_billet = name in ("K", "L", "M", "N")
+            distance = np.linalg.norm(x - point, axis=1)
+            distance[billet != in_billet] = np.inf
+            best = int(np.argmin(distance)) if len(distance) else -1
+            mine = float(distance[best]) if best >= 0 else np.inf
+            nearest, rank = self.comm.allreduce((mine, self.comm.rank), op=MPI.MINLOC)
+            if nearest < 1e-6 * self.case.profile.radius:
+                out[name] = (rank, self.comm.bcast(best, root=rank))
+        return out
+
+    def point_displacements(self, x: PETSc.Vec, points: dict[str, tuple[int, int]]) -> dict[str, tuple[float, float]]:
+        """Displacement (u_r, u_y) of named points, mm."""
+        mine = {
+            name: (float(x.array_r[2 * block]), float(x.array_r[2 * block + 1]))
+            for name, (rank, block) in points.items()
+            if rank == self.comm.rank
+        }
+        found = {name: value for part in self.comm.allgather(mine) for name, value in part.items()}
+        return {name: found[name] for name in points}
+
+    def point_gaps(self, x: PETSc.Vec) -> dict[str, float]:
+        """Gap at the billet's corners K, L, M as the first zone that holds them measures it, mm."""
+        z = self.gather(x)
+        corners = self.case.profile.points
+        out: dict[str, float] = {}
+        for term in self.terms:
+            nodes, gaps = gap_at_nodes(term.pair, z)
+            positions = _node_positions(term.pair.slave, nodes)
+            for name in ("K", "L", "M"):
+                near = np.linalg.norm(positions - corners[name], axis=1) < 1e-6 * self.case.profile.radius
+                if near.any() and name not in out:
+                    out[name] = float(gaps[near][0])
+        return out
+
+    def worst(self, x: PETSc.Vec) -> str:
+        """Where the residual is largest: zone and current place, in words."""
+        f = x.duplicate()
+        self.residual(x, f)
+        size = np.nan_to_num(np.abs(f.array_r[: self._owned]), nan=np.inf)
+        f.destroy()
+        at = int(np.argmax(size)) if len(size) else 0
+        largest, rank = self.comm.allreduce((float(size[at]) if len(size) else -1.0, self.comm.rank), op=MPI.MAXLOC)
+        text = None
+        if rank == self.comm.rank:
+            block = at // 2
+            place = self.V.tabulate_dof_coordinates()[block, :2] + x.array_r[2 * block : 2 * block + 2]
+            node = np.searchsorted(self._live, block + self._row0 // 2)
+            zones = [t.pair.name for t in self.terms if node in t.pair.slave.nodes or node in t.pair.die.nodes]
+            where = f"zone {' and '.join(zones)}" if zones else "away from the zones"
+            text = f"{where}, (r, y) = ({place[0]:.3f}, {place[1]:.3f}) mm, out of balance by {largest:.3g} N"
+        return str(self.comm.bcast(text, root=rank))
+
+    @property
+    def dofs(self) -> int:
+        """Unknowns: displacements of both bodies, fixed ones included, and multipliers."""
+        return self.n
+
+
+class TangentMatrix:
+    """Constant bulk plus changing contact entries in one PETSc matrix, held by rows.
+
+    The pattern grows when contact meets a new pair of nodes; as long as it does not, the symbolic factorisation is
+    kept. Held rows and columns are those of the identity.
+    """
+
+    def __init__(
+        self,
+        comm: MPI.Intracomm,
+        n_local: int,
+        n: int,
+        row0: int,
+        indptr: Index,
+        indices: Index,
+        data: Array,
+        held: Index,
+    ) -> None:
+        self._comm, self._n_local, self._n, self._row0 = comm, n_local, n, row0
+        self._A: PETSc.Mat | None = None
+        rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
+        is_held = np.zeros(n, dtype=bool)
+        is_held[held] = True
+        off = is_held[rows + row0] | is_held[indices]
+        data = np.where(off, 0.0, data)
+        diagonal = is_held[rows + row0] & (indices == rows + row0)
+        data[diagonal] = float(np.max(np.abs(data), initial=1.0))
+        keys = rows * np.int64(n) + indices
+        own = np.arange(n_local, dtype=np.int64)
+        own = own * np.int64(n) + own + row0  # every diagonal entry, the multipliers' too
+        self._bulk_keys, self._bulk = keys, data
+        self._set_pattern(_sorted_distinct(np.concatenate([keys, own])))
+
+    def _set_pattern(self, keys: Index) -> None:
+        self._keys = keys
+        self._base = np.zeros(len(keys))
+        self._base[np.searchsorted(keys, self._bulk_keys)] = self._bulk
+
+    def _create(self) -> PETSc.Mat:
+        rows, cols = self._keys // self._n + self._row0, self._keys % self._n
+        A = PETSc.Mat().create(self._comm)
+        A.setSizes(((self._n_local, self._n), (self._n_local, self._n)))
+        A.setType("aij")
+        A.setPreallocationCOO(rows.astype(PETSc.IntType), cols.astype(PETSc.IntType))
+        return A
+
+    def fill(self, rows: Index, cols: Index, values: Array) -> PETSc.Mat:
+        """Bulk + triplets (local rows, global columns; repeated entries add up); a new matrix if the pattern grew."""
+        keys = rows * np.int64(self._n) + cols
+        slots = np.searchsorted(self._keys, keys)
+        known = slots < len(self._keys)
+        known[known] = self._keys[slots[known]] == keys[known]
+        grows = not known.all()
+        if self._comm.size > 1:
+            grows = self._comm.allreduce(grows, op=MPI.LOR)
+        if grows:
+            new = _sorted_distinct(keys[~known])
+            self._set_pattern(np.insert(self._keys, np.searchsorted(self._keys, new), new))
+            slots = np.searchsorted(self._keys, keys)
+        data = self._base.copy()
+        np.add.at(data, slots, values)
+        if grows or self._A is None:
+            self._A = self._create()
+        self._A.setValuesCOO(data)
+        return self._A
+
+
+def _widen(comm: MPI.Intracomm, n_local: int, n: int, indptr: Index, indices: Index, data: Array) -> PETSc.Mat:
+    """The bulk matrix with empty rows and columns for the multipliers."""
+    indptr = np.append(indptr, np.full(n_local + 1 - len(indptr), indptr[-1])).astype(PETSc.IntType)
+    return PETSc.Mat().createAIJ(((n_local, n), (n_local, n)), csr=(indptr, indices, data), comm=comm)
+
+
+def _sorted_distinct(keys: Index) -> Index:
+    """`numpy.unique` by sorting: the hashed one is a hundred times slower on such keys (NumPy 2.5)."""
+    keys = np.sort(keys)
+    return keys[np.append(True, keys[1:] != keys[:-1])] if len(keys) else keys
+
+
+def _subdivide(curve: Array, parts: list[int]) -> Array:
+    pieces = [a + (b - a) * np.arange(n)[:, None] / n for a, b, n in zip(curve[:-1], curve[1:], parts, strict=True)]
+    return np.vstack([*pieces, curve[-1:]])
+
+
+def _node_positions(surface: Surface, nodes: Index) -> Array:
+    number, first = np.unique(surface.nodes, return_index=True)
+    return np.asarray(surface.X.reshape(-1, 2)[first[np.searchsorted(number, nodes)]])

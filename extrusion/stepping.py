@@ -1,0 +1,150 @@
+"""Load stepping: a table of increments into accepted steps.
+
+An increment that does not converge is cut in half, and grows again once it does. The driver yields each accepted step;
+files, pictures and progress bars observe it, and the loop does not know them.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from petsc4py import PETSc
+
+import numpy as np
+
+from extrusion.errors import StepError
+from extrusion.newton import Newton
+from extrusion.problem import Problem
+from extrusion.zones import ContactState
+
+log = logging.getLogger(__name__)
+
+MAX_CUTS = 8
+"""Halvings of one increment before the step is given up."""
+
+PASSES = 30
+"""Geometry passes of one increment (nodal contact) before it is cut."""
+
+PASS_TOLERANCE = 0.01
+"""Passes stop when the displacement increment changes by less than this part of itself (the sheet's RESI_GEOM)."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """An accepted step."""
+
+    t: float  # displacement of the rear face, mm
+    points: dict[str, tuple[float, float]]  # displacement (u_r, u_y) of named points, mm
+    reaction: float  # axial force on the rear face, N, whole revolution, positive when it pushes the billet in +y
+    die_reaction: float  # axial force of the die's supports on the die, N, whole revolution
+    energy: float  # elastic energy, N mm
+    iterations: int  # linear solves, over all passes and cuts
+    passes: int  # geometry passes of the accepted increment
+    cuts: int
+    residual: float  # N
+    gap: dict[str, float]  # at the named slave points, mm
+    zones: dict[str, ContactState] = field(repr=False)
+    x: PETSc.Vec = field(repr=False, compare=False)  # live: copy what must outlast the step
+
+
+def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step]:
+    """Drive the billet through the times (mm), yielding accepted steps.
+
+    Raises:
+        StepError: An increment could not be solved even when cut; its message gives time, zone, place and remedy.
+    """
+    x, accepted = problem.x, problem.x.duplicate()
+    x.set(0.0)
+    problem.start(x)
+    points = problem.named_points()
+    t = 0.0
+    for target in times:
+        cuts = iterations = passes = 0
+        share = 1.0  # part of the remaining increment that is tried
+        while t < target:
+            dt = (target - t) * share
+            if share == 1.0 or t + dt > target:
+                goal, dt = target, target - t
+            else:
+                goal = t + dt
+            x.copy(accepted)
+            outcome = _increment(problem, newton, accepted, goal, dt)
+            iterations += outcome.iterations
+            if outcome.converged:
+                t, passes = goal, outcome.passes
+                problem.accept(x)
+                share = min(1.0, 2 * share * dt / max(target - t, dt)) if t < target else 1.0
+                continue
+            cuts += 1
+            place = problem.worst(x)
+            accepted.copy(x)
+            problem.pair_up(x)
+            if cuts > MAX_CUTS:
+                raise StepError(
+                    f"step to t = {goal:.6g} mm not solved after {cuts - 1} cuts: {outcome.reason}; {place}. "
+                    f"{outcome.remedy}"
+                )
+            log.info("t = %.6g mm: %s; %s; cut to %.3g mm", goal, outcome.reason, place, dt / 2)
+            share = share / 2 if share < 1 else dt / 2 / (target - t)
+        z = problem.gather(x)
+        rear, die = problem.reactions(x)
+        yield Step(
+            t=t,
+            points=problem.point_displacements(x, points),
+            reaction=rear,
+            die_reaction=die,
+            energy=problem.energy(x),
+            iterations=iterations,
+            passes=passes,
+            cuts=cuts,
+            residual=outcome.residual,
+            gap=problem.point_gaps(x),
+            zones={term.pair.name: term.state(z) for term in problem.terms},
+            x=x,
+        )
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    converged: bool
+    iterations: int
+    passes: int
+    residual: float
+    reason: str
+    remedy: str = "Try a smaller --increment, a finer mesh, or --method nitsche"
+
+
+def _increment(problem: Problem, newton: Newton, accepted: PETSc.Vec, t: float, dt: float) -> _Attempt:
+    """Solve one increment in place; with frozen pairing, by geometry passes (at least two, as the sheet has it)."""
+    x = problem.x
+    problem.shift_billet(x, dt)
+    problem.drive(x, t)
+    frozen = problem.case.method == "nodal" and problem.n_multipliers > 0
+    iterations, change = 0, x.duplicate()
+    seen: list[float] = []
+    previous = x.duplicate()
+    for attempt in range(1, (PASSES if frozen else 1) + 1):
+        problem.pair_up(x)
+        x.copy(previous)
+        outcome = newton.solve(x)
+        iterations += outcome.iterations
+        if not outcome.converged:
+            return _Attempt(False, iterations, attempt, outcome.residual, outcome.reason)
+        if not frozen:
+            break
+        change.waxpy(-1.0, previous, x)
+        moved = problem.largest_displacement(change)
+        change.waxpy(-1.0, accepted, x)
+        if attempt >= 2 and moved <= PASS_TOLERANCE * problem.largest_displacement(change):
+            break
+        seen.append(moved)
+    else:
+        two = len(seen) > 4 and np.isclose(seen[-1], seen[-3], rtol=1e-3)
+        reason = (
+            f"the pairing {'flips between two states' if two else 'does not settle'} (last change {seen[-1]:.3g} mm)"
+        )
+        remedy = "A node rests on a die corner: change the --increment a little, or use --method nitsche"
+        return _Attempt(False, iterations, PASSES, outcome.residual, reason, remedy)
+    return _Attempt(True, iterations, attempt, outcome.residual, outcome.reason)

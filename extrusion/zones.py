@@ -1,0 +1,424 @@
+"""The contact term of one zone: points of the slave surface, a gap, a law and a closure.
+
+A term works on the *contact vector* z: the displacements of all nodes that contact can touch, then the multipliers.
+It adds to the residual ``G^T (w sigma_n)`` and what the law asks for, and gives the exact derivative. Two states:
+`accept` moves the accepted one (the bilateral memory); residuals and tangents only read it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from extrusion.contact import CLOSED_GAP, Closure, project
+from extrusion.elasticity import Elastic
+from extrusion.gap import (
+    Array,
+    Index,
+    Points,
+    Surface,
+    closest_rows,
+    polyline_points,
+    ray_gap,
+    ray_points,
+    shape,
+    stress_rows,
+)
+
+Triplets = tuple[Index, Index, Array]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two surfaces that face each other, as a zone sees them."""
+
+    name: str
+    slave: Surface
+    die: Surface  # the master; the die unless the zone's roles are exchanged
+    axis: int  # component along which the ray runs
+    sign: float  # +1 if the master lies towards larger values of it
+    closure: Closure
+    ray: bool  # gap along the ray (else to the closest point)
+    smooth: bool  # averaged normals (closest point)
+    extended: bool  # the master's end lines go on past its ends; else a bilateral point there is let go
+    axisymmetric: bool = True
+
+    @property
+    def direction(self) -> Array:
+        """Unit vector along the ray, towards the master."""
+        return self.sign * np.eye(2)[self.axis]
+
+
+@dataclass(frozen=True)
+class ContactState:
+    """What a zone reports; row i is a contact point, in order along the slave."""
+
+    x: Array  # (n, 2) current position, mm
+    s: Array  # (n,) reference arc length along the slave surface, mm
+    gap: Array  # (n,) mm, positive when open
+    pressure: Array  # (n,) normal to the die, MPa, positive when pressed
+    ray_pressure: Array  # (n,) its component along the ray per reference area, MPa
+    weight: Array  # (n,) integration weight, mm^2
+    closed: np.ndarray = field(repr=False)  # (n,) bool
+
+
+class ContactTerm(Protocol):
+    """What the problem asks of a zone."""
+
+    pair: Pair
+    multipliers: int
+
+    def start(self, z: Array) -> None:
+        """Set the accepted state at t = 0 from the gap there."""
+
+    def pair_up(self, z: Array) -> None:
+        """Freeze what the term freezes of the geometry (nothing, for terms that follow it)."""
+
+    def add_residual(self, z: Array, R: Array) -> None:
+        """Add the term's forces (N) to R."""
+
+    def tangent(self, z: Array, geometric: bool) -> Triplets:
+        """Derivative of the residual as (rows, columns, values); ``geometric`` adds the second variation of the gap."""
+
+    def accept(self, z: Array) -> None:
+        """Make z the accepted state."""
+
+    def state(self, z: Array) -> ContactState:
+        """Report at z."""
+
+
+def closed_at_start(gap: Array, radius: float, interpenetrating: bool) -> np.ndarray:
+    """Points that a bilateral zone holds from t = 0: gap zero, or also negative where the start may interpenetrate."""
+    touching = np.abs(gap) < CLOSED_GAP * radius
+    return touching | (gap < 0) if interpenetrating else touching
+
+
+class NodalContact:
+    """Exact constraint at the slave nodes by an active set, one multiplier (N, whole revolution) a node.
+
+    The pairing (die segment, place and normal) is frozen by `pair_up`; between two of these the problem is a linear
+    complementarity problem, and its semismooth Newton iteration a primal-dual active set (Hintermüller, Ito,
+    Kunisch 2002, doi:10.1137/S1052623401383558)::
+
+        trial = lambda + kappa g;  residual  K u - f + G^T lambda,  min(trial, 0) - lambda
+    """
+
+    def __init__(self, pair: Pair, first: int, stiffness: Array, radius: float, interpenetrating: bool = False) -> None:
+        slave = pair.slave
+        self.pair = pair
+        self.nodes = slave.node_numbers
+        self.X = polyline_points(slave)
+        self.weight = nodal_weights(slave, pair.axisymmetric)
+        self.multipliers = 0 if pair.closure == "check" else len(self.nodes)
+        self.at = first + np.arange(self.multipliers)
+        self._kappa = np.full(len(self.nodes), float(np.mean(stiffness) * np.mean(np.abs(self.weight))))
+        self._radius, self._interpenetrating = radius, interpenetrating
+        self.closed = np.zeros(len(self.nodes), dtype=bool)
+
+    def start(self, z: Array) -> None:
+        self.pair_up(z)
+        self.closed = closed_at_start(self._g0 + self._apply(z), self._radius, self._interpenetrating)
+
+    def pair_up(self, z: Array) -> None:
+        pair = self.pair
+        x = self.X + _displacement(z, self.nodes)
+        if pair.ray:
+            g, slope, self._G, self._cols, self._past = _ray_rows(pair, self.nodes, x, z)
+            self._cos = 1 / np.sqrt(1 + slope**2)
+        else:
+            ones = np.ones((len(x), 1))
+            found, g, self._G, self._cols = closest_rows(self.nodes[:, None], ones, x, pair.die, _even(z), pair.smooth)
+            self._past, self._cos = found.past, np.abs(found.normal @ pair.direction)
+        self._g0 = g - self._apply(z)
+
+    def _apply(self, z: Array) -> Array:
+        return np.einsum("nl,nl->n", self._G, z[self._cols])
+
+    def _law(self, z: Array) -> tuple[Array, Array, Array]:
+        lam = z[self.at]
+        gap = self._g0 + self._apply(z)
+        held = self.closed & ~self._past if not self.pair.extended else self.closed
+        sc, dsc = project(lam + self._kappa * gap, self.pair.closure, held)
+        if self.pair.closure == "bilateral" and not self.pair.extended:
+            sc, dsc = np.where(self._past, 0.0, sc), np.where(self._past, 0.0, dsc)
+        return gap, sc, dsc
+
+    def add_residual(self, z: Array, R: Array) -> None:
+        if self.multipliers:
+            _, sc, _ = self._law(z)
+            lam = z[self.at]
+            np.add.at(R, self._cols, lam[:, None] * self._G)
+            R[self.at] += sc - lam
+
+    def tangent(self, z: Array, geometric: bool) -> Triplets:
+        if not self.multipliers:
+            return _none()
+        _, _, dsc = self._law(z)
+        at = np.broadcast_to(self.at[:, None], self._cols.shape)
+        constraint = (dsc * self._kappa)[:, None] * self._G
+        return (
+            np.concatenate([self._cols.ravel(), at.ravel(), self.at]),
+            np.concatenate([at.ravel(), self._cols.ravel(), self.at]),
+            np.concatenate([self._G.ravel(), constraint.ravel(), dsc - 1.0]),
+        )
+
+    def accept(self, z: Array) -> None:
+        if self.multipliers:
+            self.closed = (
+                self._law(z)[2] > 0 if self.pair.closure != "bilateral" else self.closed | (self._law(z)[2] > 0)
+            )
+            if self.pair.closure == "bilateral" and not self.pair.extended:
+                self.closed &= ~self._past
+
+    def state(self, z: Array) -> ContactState:
+        x = self.X + _displacement(z, self.nodes)
+        gap = self._g0 + self._apply(z)
+        if self.multipliers:
+            gap, sc, dsc = self._law(z)
+            closed = dsc > 0
+        else:
+            sc, closed = np.zeros(len(x)), gap < 0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            stress = np.where(np.abs(self.weight) > 1e-9 * np.max(self.weight), -sc / self.weight, np.nan)
+        normal = stress / self._cos if self.pair.ray else stress
+        s = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self.X, axis=0), axis=1)))
+        return ContactState(x, s, gap, normal, normal * self._cos, self.weight, closed)
+
+
+class IntegratedContact:
+    """Penalty or Nitsche's method at quadrature points of the slave facets, split at the die's kinks (ray gap).
+
+    ::
+
+        trial = S u + k g;  sc = project(trial);  residual  w [ G^T sc + theta / k S^T (sc - S u) ]
+
+    with S u = 0 for the penalty. Chouly, Hild, Renard 2015, doi:10.1090/S0025-5718-2014-02913-X; large sliding:
+    Mlika, Renard, Chouly 2017, doi:10.1016/j.cma.2017.06.034. With a ray gap the tangent is the exact derivative of
+    the residual, moving split points included.
+    """
+
+    multipliers = 0
+
+    def __init__(
+        self,
+        pair: Pair,
+        stiffness: Array,
+        material: Elastic | None,
+        theta: int,
+        radius: float,
+        interpenetrating: bool = False,
+        order: int = 4,
+    ) -> None:
+        self.pair, self._k, self._material, self._theta = pair, stiffness, material, theta
+        self._radius, self._interpenetrating, self._order = radius, interpenetrating, order
+        self.closed = np.zeros(len(pair.slave.nodes), dtype=bool)
+
+    def start(self, z: Array) -> None:
+        held = closed_at_start(self._points(z, False)[0].gap, self._radius, self._interpenetrating)
+        self.closed = self._whole_facets(self._points(z, False)[0], held)
+
+    def pair_up(self, z: Array) -> None:
+        pass
+
+    def _whole_facets(self, points: Points, held: np.ndarray) -> np.ndarray:
+        every = np.ones(len(self.closed), dtype=bool)
+        np.logical_and.at(every, points.facet, held.all(axis=1))
+        return every
+
+    def _points(self, z: Array, variation: bool) -> tuple[Points, Array | None, Array | None]:
+        """Contact points with the rows of the slave's own stress and their derivative, over the points' columns."""
+        pair = self.pair
+        if pair.ray:
+            points = ray_points(
+                pair.slave,
+                pair.die,
+                _even(z),
+                pair.axis,
+                pair.sign,
+                self._order,
+                pair.axisymmetric,
+                variation,
+            )
+            direction: Array = pair.direction
+        else:
+            points, direction = _closest_integration_points(pair, z, self._order)
+        if self._material is None:
+            return points, None, None
+        S, S_xi = stress_rows(
+            pair.slave, points.facet, points.xi, direction, self._material.lmbda, self._material.mu,
+            pair.axisymmetric, variation and pair.ray,
+        )  # fmt: skip
+        pad = ((0, 0), (0, 0), (0, points.G.shape[2] - S.shape[2]))
+        return points, np.pad(S, pad), None if S_xi is None else np.pad(S_xi, pad)
+
+    def _law(self, z: Array, points: Points, S: Array | None) -> tuple[Array, Array, Array, Array]:
+        k = self._k[points.facet][:, None]
+        own = np.einsum("nql,nl->nq", S, z[points.cols]) if S is not None else np.zeros_like(points.gap)
+        held = np.broadcast_to(self.closed[points.facet][:, None], own.shape)
+        sc, dsc = project(own + k * points.gap, self.pair.closure, held)
+        if self.pair.closure == "bilateral" and not self.pair.extended:
+            sc, dsc = np.where(points.past, 0.0, sc), np.where(points.past, 0.0, dsc)
+        return own, sc, dsc, k
+
+    def add_residual(self, z: Array, R: Array) -> None:
+        if self.pair.closure == "check":
+            return
+        points, S, _ = self._points(z, False)
+        own, sc, _, k = self._law(z, points, S)
+        force = np.einsum("nq,nql->nl", points.weight * sc, points.G)
+        if S is not None and self._theta:
+            force += np.einsum("nq,nql->nl", points.weight * self._theta / k * (sc - own), S)
+        np.add.at(R, points.cols, force)
+
+    def tangent(self, z: Array, geometric: bool) -> Triplets:
+        if self.pair.closure == "check":
+            return _none()
+        points, S, S_xi = self._points(z, geometric)
+        own, sc, dsc, k = self._law(z, points, S)
+        theta = self._theta if S is not None else 0
+        if not theta:  # open pieces carry nothing
+            on = (dsc > 0).any(axis=1)
+            points, own, sc, dsc, k = _take(points, on), own[on], sc[on], dsc[on], k[on]
+            S, S_xi = (None if a is None else a[on] for a in (S, S_xi))
+        z_local = z[points.cols]
+        w, G = points.weight[..., None], points.G
+        d_own = S if S is not None else np.zeros_like(G)
+        d_gap = G
+        if geometric and points.dxi is not None and points.gap_xi is not None:
+            d_gap = G + points.gap_xi[..., None] * points.dxi
+            if S is not None and S_xi is not None:
+                d_own = S + np.einsum("nql,nl->nq", S_xi, z_local)[..., None] * points.dxi
+        d_sc = dsc[..., None] * (d_own + k[..., None] * d_gap)
+        test = G + theta / k[..., None] * S if S is not None and theta else G
+        left, right = [w * test], [d_sc]
+        if S is not None and theta:
+            left.append(-w * theta / k[..., None] * S)
+            right.append(d_own)
+        if geometric and points.dxi is not None and points.G_xi is not None and points.dweight is not None:
+            w_sc = w * sc[..., None]
+            force, along = G * sc[..., None], w_sc * points.G_xi
+            if S is not None and S_xi is not None and theta:
+                rest = (theta / k * (sc - own))[..., None]
+                force, along = force + rest * S, along + w * rest * S_xi
+            left += [force, along]
+            right += [points.dweight, points.dxi]
+            for a, b in points.curvature:
+                left.append(w_sc * a)
+                right.append(b)
+        J = np.swapaxes(np.concatenate(left, axis=1), 1, 2) @ np.concatenate(right, axis=1)
+        rows = np.broadcast_to(points.cols[:, :, None], J.shape)
+        cols = np.broadcast_to(points.cols[:, None, :], J.shape)
+        return rows.ravel(), cols.ravel(), J.ravel()
+
+    def accept(self, z: Array) -> None:
+        if self.pair.closure == "bilateral":
+            points, S, _ = self._points(z, False)
+            _, _, dsc, _ = self._law(z, points, S)
+            self.closed |= self._whole_facets(points, dsc > 0)
+
+    def state(self, z: Array) -> ContactState:
+        points, S, _ = self._points(z, False)
+        _, sc, dsc, _ = self._law(z, points, S)
+        slave = self.pair.slave
+        N = shape(points.xi, slave.nodes.shape[1])
+        x = N @ (slave.X + _displacement(z, slave.nodes))[points.facet]
+        start = np.append(0.0, np.cumsum(slave.length))
+        s = start[points.facet][:, None] + points.xi * slave.length[points.facet][:, None]
+        cos = 1 / np.sqrt(1 + points.slope**2)
+        ray, normal = (-sc, -sc / cos) if self.pair.ray else (-sc * cos, -sc)
+        closed = points.gap < 0 if self.pair.closure == "check" else dsc > 0
+        return ContactState(
+            x.reshape(-1, 2),
+            s.ravel(),
+            points.gap.ravel(),
+            normal.ravel(),
+            ray.ravel(),
+            points.weight.ravel(),
+            closed.ravel(),
+        )
+
+
+def nodal_weights(surface: Surface, axisymmetric: bool) -> Array:
+    """Integral of each node's shape function over the reference surface (2 pi r ds, or ds), mm^2 or mm."""
+    xi, omega = np.polynomial.legendre.leggauss(3)
+    xi, omega = (xi + 1) / 2, omega / 2
+    N = shape(xi, surface.nodes.shape[1])
+    r = N @ surface.X[..., 0, None]
+    measure = surface.length[:, None] * omega * (2 * np.pi * r[..., 0] if axisymmetric else 1.0)
+    nodes = surface.node_numbers
+    out = np.zeros(nodes.max() + 1)
+    np.add.at(out, surface.nodes, measure @ N)
+    return np.asarray(out[nodes])
+
+
+def gap_at_nodes(pair: Pair, z: Array) -> tuple[Index, Array]:
+    """Slave nodes in order and the zone's gap there, mm."""
+    nodes = pair.slave.node_numbers
+    x = polyline_points(pair.slave) + _displacement(z, nodes)
+    if pair.ray:
+        return nodes, ray_gap(x, pair.die, _even(z), pair.axis, pair.sign)[0]
+    return nodes, closest_rows(nodes[:, None], np.ones((len(x), 1)), x, pair.die, _even(z), pair.smooth)[1]
+
+
+def _even(z: Array) -> Array:
+    """The contact vector cut to an even length, so that it reads as pairs (multipliers stand at its end)."""
+    return z[: len(z) - len(z) % 2]
+
+
+def _displacement(z: Array, nodes: Index) -> Array:
+    return np.stack([z[2 * nodes], z[2 * nodes + 1]], axis=-1)
+
+
+def _none() -> Triplets:
+    return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0)
+
+
+def _take(points: Points, on: np.ndarray) -> Points:
+    values = {name: value[on] if isinstance(value, np.ndarray) else value for name, value in vars(points).items()}
+    values["curvature"] = tuple((a[on], b[on]) for a, b in points.curvature)
+    return Points(**values)
+
+
+def _ray_rows(pair: Pair, nodes: Index, x: Array, z: Array) -> tuple[Array, Array, Array, Index, np.ndarray]:
+    """Ray gap at nodes, the die's slope, rows and columns, and which lie past the die's ends."""
+    p, c, sign, die = 1 - pair.axis, pair.axis, pair.sign, pair.die
+    xd = die.X + _displacement(z, die.nodes)
+    e = np.clip(np.searchsorted(xd[:, 0, p], x[:, p], side="right") - 1, 0, len(xd) - 1)
+    gap, slope = ray_gap(x, die, _even(z), pair.axis, sign)
+    k = (x[:, p] - xd[e, 0, p]) / (xd[e, 1, p] - xd[e, 0, p])
+    past = (k < -1e-9) | (k > 1 + 1e-9)
+    M = shape(k, 2)
+    G = np.zeros((len(x), 6))
+    G[:, c], G[:, p] = -sign, sign * slope
+    G[:, 2 + c], G[:, 4 + c] = sign * M[:, 0], sign * M[:, 1]
+    G[:, 2 + p], G[:, 4 + p] = -sign * slope * M[:, 0], -sign * slope * M[:, 1]
+    three = np.concatenate([nodes[:, None], die.nodes[e, :2]], axis=1)
+    cols = (2 * three[..., None] + np.arange(2)).reshape(len(x), -1)
+    return gap, slope, G, cols, past
+
+
+def _closest_integration_points(pair: Pair, z: Array, order: int) -> tuple[Points, Array]:
+    slave = pair.slave
+    xi, omega = np.polynomial.legendre.leggauss(order)
+    xi, omega = (xi + 1) / 2, omega / 2
+    m, K = slave.cell_nodes.shape
+    N = np.broadcast_to(shape(xi, slave.nodes.shape[1]), (m, order, slave.nodes.shape[1]))
+    x = (N @ (slave.X + _displacement(z, slave.nodes))).reshape(-1, 2)
+    r = N @ slave.X[..., 0, None]
+    measure = slave.length[:, None] * omega * (2 * np.pi * r[..., 0] if pair.axisymmetric else 1.0)
+    full = np.zeros((m, order, K))
+    np.put_along_axis(full, np.broadcast_to(slave.local[:, None], N.shape), N, axis=2)
+    behind = np.repeat(slave.cell_nodes, order, axis=0)
+    found, gap, G, cols = closest_rows(behind, full.reshape(-1, K), x, pair.die, _even(z), pair.smooth)
+    facet = np.repeat(
+        np.arange(m), order
+    )  # every point is a piece of its own: its die facet differs from its neighbour's
+    normal = found.normal
+    slope = normal[:, 1 - pair.axis] / np.where(normal[:, pair.axis] == 0, 1e-300, normal[:, pair.axis])
+    points = Points(
+        facet=facet, die=found.segment, cols=cols, xi=np.tile(xi, m)[:, None], weight=measure.reshape(-1, 1),
+        gap=gap[:, None], G=G[:, None], slope=slope[:, None], past=found.past[:, None],
+    )  # fmt: skip
+    return points, -normal[:, None]
