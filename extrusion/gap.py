@@ -154,10 +154,11 @@ def ray_points(
     """Quadrature points of the slave facets, split at every deformed die vertex, with the gap along a fixed ray.
 
     The ray runs along coordinate ``axis`` (c) with ``sign`` from the slave to the die; the die is a graph over the
-    other coordinate (p), and its end facets' lines extend past its ends::
+    other coordinate (p). Past its ends it goes on straight from the end vertex, at the end facet's reference slope
+    (turning with the end facet it would hang on a lever as long as that facet, however small the mesh makes it)::
 
-        gap = sign (x_c(k) + s e - x_s,c)          x_p(k) = x_s,p inside;  e = x_s,p - x_p(k) past an end
-        dgap = sign (M.dd_c - N.du_c + s a + e b)  a = N.du_p - M.dd_p,  b = (M'.dd_c - s M'.dd_p) / x_p'
+        gap = sign (x_c(k) + s e - x_s,c)    x_p(k) = x_s,p and e = 0 inside;  e = x_s,p - x_p(k) past an end
+        dgap = sign (M.dd_c - N.du_c + s a)  a = N.du_p - M.dd_p;  ds = b = (M'.dd_c - s M'.dd_p) / x_p'
 
     and the second variation as CONTACT section 1 has it. The split points move with both bodies:
     ``dz = (dd_v,p - N.du_p) / x_s,p'``; with them move the points and weights of the pieces they bound, so that the
@@ -229,7 +230,7 @@ def ray_points(
     k = np.where(outside, np.where(after, 1.0, 0.0)[:, None], k)
     M, dM, ddM = (shape(k, k_d, i) for i in range(3))
     x_d, dx_d, ddx_d = M @ xd, dM @ xd, ddM @ xd
-    slope = dx_d[..., c] / dx_d[..., p]
+    slope = np.where(outside, _reference_slope(die, axis)[e][:, None], dx_d[..., c] / dx_d[..., p])
     excess = np.where(outside, x_s[..., p] - x_d[..., p], 0.0)
     gap = sign * (x_d[..., c] + slope * excess - x_s[..., c])
 
@@ -247,10 +248,9 @@ def ray_points(
         return out
 
     dp = dx_d[..., p, None]
-    s_, e_ = slope[..., None], excess[..., None]
+    s_ = slope[..., None]
     a = rows(N, -M, p)
-    b = rows(None, dM / dp, c) + rows(None, -s_ * dM / dp, p)
-    G = sign * (rows(-N, M, c) + s_ * a + e_ * b)
+    G = sign * (rows(-N, M, c) + s_ * a)
     points = dict(
         facet=facet, die=e, cols=cols, xi=xi, weight=weight, gap=gap, G=G, slope=slope,
         past=np.broadcast_to(outside, xi.shape),
@@ -260,7 +260,8 @@ def ray_points(
 
     # 4. second variation at fixed xi, variation of the split points, and of the points and weights they carry
     kappa = np.where(outside, 0.0, (ddx_d[..., c] - slope * ddx_d[..., p]) / dx_d[..., p] ** 2)[..., None]
-    a_eff = a - e_ * rows(None, dM / dp, p)
+    turning = np.where(outside[..., None], 0.0, dM / dp)
+    b = rows(None, turning, c) + rows(None, -s_ * turning, p)
     dxs_p = dx_s[..., p, None]
     G_xi = sign * (rows(-dN, None, c) + s_ * rows(dN, None, p) + dxs_p * (b + kappa * a))
     gap_xi = sign * (slope * dx_s[..., p] - dx_s[..., c])
@@ -283,10 +284,15 @@ def ray_points(
         **points,
         gap_xi=gap_xi,
         G_xi=G_xi,
-        curvature=((sign * a_eff, b), (sign * b, a_eff), (sign * kappa * a, a)),
+        curvature=((sign * a, b), (sign * b, a), (sign * kappa * a, a)),
         dxi=dxi,
         dweight=dweight,
     )
+
+
+def _reference_slope(die: Surface, axis: int) -> Array:
+    chord = die.X[:, 1] - die.X[:, 0]
+    return np.asarray(chord[:, axis] / chord[:, 1 - axis])
 
 
 def _dofs(nodes: Index) -> Index:
@@ -462,8 +468,9 @@ def ray_gap(x: Array, die: Surface, z: Array, axis: int, sign: float) -> tuple[A
     p, c = 1 - axis, axis
     xd = die.X + z.reshape(-1, 2)[die.nodes]
     e = np.clip(np.searchsorted(xd[:, 0, p], x[:, p], side="right") - 1, 0, len(xd) - 1)
-    k = np.clip(invert(xd[e][:, :, p], x[:, p]), 0.0, 1.0)
+    place = invert(xd[e][:, :, p], x[:, p])
+    k = np.clip(place, 0.0, 1.0)
     at = np.einsum("nk,nki->ni", shape(k, xd.shape[1]), xd[e])
     tangent = np.einsum("nk,nki->ni", shape(k, xd.shape[1], 1), xd[e])
-    slope = tangent[:, c] / tangent[:, p]
+    slope = np.where(place == k, tangent[:, c] / tangent[:, p], _reference_slope(die, axis)[e])
     return sign * (at[:, c] + slope * (x[:, p] - at[:, p]) - x[:, c]), slope

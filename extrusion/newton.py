@@ -42,7 +42,7 @@ class Newton:
     ) -> None:
         self.problem, self.atol = problem, atol
         self._max = max_iterations
-        self._near = 1e-3 * problem.case.profile.radius if near is None else near
+        self._near = 0.02 * problem.case.profile.radius if near is None else near
         self._update = np.inf
         self._f = problem.x.duplicate()
         self._trial = problem.x.duplicate()

@@ -59,7 +59,8 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
     x.set(0.0)
     problem.start(x)
     points = problem.named_points()
-    t = 0.0
+    t, rate = 0.0, x.duplicate()
+    problem.shift_billet(rate, 1.0)  # du/dt that predicts the next increment: rigid at first, then that of the last one
     for target in times:
         cuts = iterations = passes = 0
         share = 1.0  # part of the remaining increment that is tried
@@ -70,14 +71,20 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
             else:
                 goal = t + dt
             x.copy(accepted)
-            outcome = _increment(problem, newton, accepted, goal, dt)
+            x.axpy(dt, rate)
+            problem.drive(x, goal)
+            outcome = _increment(problem, newton, accepted)
             iterations += outcome.iterations
             if outcome.converged:
                 t, passes = goal, outcome.passes
                 problem.accept(x)
+                rate.waxpy(-1.0, accepted, x)
+                rate.scale(1 / dt)
                 share = min(1.0, 2 * share * dt / max(target - t, dt)) if t < target else 1.0
                 continue
             cuts += 1
+            rate.set(0.0)
+            problem.shift_billet(rate, 1.0)
             place = problem.worst(x)
             accepted.copy(x)
             problem.pair_up(x)
@@ -116,11 +123,9 @@ class _Attempt:
     remedy: str = "Try a smaller --increment, a finer mesh, or --method nitsche"
 
 
-def _increment(problem: Problem, newton: Newton, accepted: PETSc.Vec, t: float, dt: float) -> _Attempt:
-    """Solve one increment in place; with frozen pairing, by geometry passes (at least two, as the sheet has it)."""
+def _increment(problem: Problem, newton: Newton, accepted: PETSc.Vec) -> _Attempt:
+    """Solve one predicted increment in place; with frozen pairing, by geometry passes (two at least, as the sheet)."""
     x = problem.x
-    problem.shift_billet(x, dt)
-    problem.drive(x, t)
     frozen = problem.case.method == "nodal" and problem.n_multipliers > 0
     iterations, change = 0, x.duplicate()
     seen: list[float] = []
