@@ -8,7 +8,7 @@ the nodes of one die facet, two components each; ``cols`` says where these stand
 Two ways to measure the gap (DESIGN section 1, CONTACT section 1), positive when open:
 
 - `ray_points`: along a fixed coordinate direction, at quadrature points split at every vertex of the deformed die;
-- `closest_points`: to the closest point of the die's polyline, along the die's normal.
+- `closest_points`: to the closest point of the die, along the die's normal.
 """
 
 from __future__ import annotations
@@ -366,62 +366,94 @@ def stress_rows(
     return rows, combine(hoop_xi, grad_xi)
 
 
+KEPT = 0.02
+"""How far past the end of its facet a point may project and stay with it, relative to the facet's length."""
+
+
 @dataclass(frozen=True)
 class Pairing:
-    """Closest points on the die: row i belongs to point i; the gap is ``n . (x_s - x_m)``, linear in z."""
+    """Closest points on the die: row i belongs to point i; its gap is ``n . (x_s - x_d(k))``."""
 
-    segment: Index  # (n,) segment of the die's polyline
-    k: Array  # (n,) place on it in [0, 1]; outside where the line is extended
+    facet: Index  # (n,) facet of the die
+    k: Array  # (n,) place on it, in [0, 1]
     normal: Array  # (n, 2) unit normal of the die, into the bore
-    past: NDArray[np.bool_]  # (n,) projects past an end of the die
+    past: NDArray[np.bool_]  # (n,) lies past an end of the die; the gap is that to the straight extension
 
 
-def closest_points(x: Array, line: Array, side: float, smooth: bool = False) -> Pairing:
-    """Closest point of each x on a polyline, its end segments extended past the ends.
+def closest_points(x: Array, facets: Array, side: float, smooth: bool = False, keep: Index | None = None) -> Pairing:
+    """Closest point of each x on a curve of linear or quadratic facets that goes on straight past its ends.
 
-    A point exactly opposite a vertex belongs to the segment ahead (the later one along the curve).
+    A point exactly opposite a vertex belongs to the facet ahead (the later one along the curve).
 
     Args:
         x: Points, ``shape=(n, 2)``, mm.
-        line: Vertices in their current position, ``shape=(m + 1, 2)``, mm.
-        side: +1 if the die lies to the left of the line, -1 if to the right.
-        smooth: Normals averaged at the vertices and interpolated, instead of each segment's own.
+        facets: Nodes of the facets in their current position, ``shape=(m, k, 2)``, in order, mm.
+        side: +1 if the die lies to the left of the curve, -1 if to the right.
+        smooth: Normals averaged at the vertices and interpolated, instead of the facet's own.
+        keep: Facets of an earlier pairing, ``shape=(n,)``: a point stays with its own while it projects no farther
+            past that facet's end than `KEPT` of its length, so that a point resting on a vertex does not flip.
 
     Raises:
-        ValueError: If a segment has zero length (its index is in the message).
+        ValueError: If a facet has zero length (its index is in the message).
     """
-    start, t = line[:-1], np.diff(line, axis=0)
+    m, k_d = facets.shape[:2]
+    # 1. nearest straight piece (a quadratic facet counts as two), ties to the later one
+    line = facets if k_d == 2 else facets[:, [0, 2, 2, 1]].reshape(2 * m, 2, 2)
+    start, t = line[:, 0], line[:, 1] - line[:, 0]
     length2 = np.einsum("ij,ij->i", t, t)
     if not np.all(length2 > 0):
-        raise ValueError(f"segment {int(np.argmin(length2))} of the die has zero length")
-    normal = side * np.stack([t[:, 1], -t[:, 0]], axis=1) / np.sqrt(length2)[:, None]
+        raise ValueError(f"facet {int(np.argmin(length2)) * m // len(line)} of the die has zero length")
     offset = x[:, None] - start
-    k = np.einsum("nmj,mj->nm", offset, t) / length2
-    clipped = np.clip(k, 0.0, 1.0)
-    distance = np.linalg.norm(offset - clipped[..., None] * t, axis=2)
-    # ties go to the later segment, whatever the round-off of the two distances
+    along = np.einsum("nmj,mj->nm", offset, t) / length2
+    distance = np.linalg.norm(offset - np.clip(along, 0.0, 1.0)[..., None] * t, axis=2)
     near = distance <= distance.min(axis=1, keepdims=True) + 1e-9 * np.sqrt(length2.max())
-    segment = near.shape[1] - 1 - np.argmax(near[:, ::-1], axis=1)
+    piece = near.shape[1] - 1 - np.argmax(near[:, ::-1], axis=1)
     row = np.arange(len(x))
-    place = k[row, segment]
-    first, last = segment == 0, segment == len(t) - 1
     tolerance = 1e-9
-    past = (first & (place < -tolerance)) | (last & (place > 1 + tolerance))
-    place = np.where(past, place, np.clip(place, 0.0, 1.0))
-    n = normal[segment]
+    past = ((piece == 0) & (along[row, 0] < -tolerance)) | ((piece == len(line) - 1) & (along[row, -1] > 1 + tolerance))
+    facet, k = piece, along[row, piece]
+    if k_d == 3:
+        facet, k = piece // 2, (k + piece % 2) / 2
+    if keep is not None:
+        chord = facets[:, 1] - facets[:, 0]
+        kept = np.einsum("nj,nj->n", x - facets[keep, 0], chord[keep]) / np.einsum("nj,nj->n", chord[keep], chord[keep])
+        stays = (np.abs(keep - facet) == 1) & (np.abs(kept - 0.5) <= 0.5 + KEPT)
+        facet, k = np.where(stays, keep, facet), np.where(stays, kept, k)
+    k = np.clip(k, 0.0, 1.0)
+    # 2. closest point of the facet, and its normal
+    nodes = facets[facet]
+    if k_d == 3:
+        for _ in range(5):
+            x_d, dx_d, ddx_d = (np.einsum("nk,nki->ni", shape(k, 3, i), nodes) for i in range(3))
+            d = x_d - x
+            slope = np.einsum("ni,ni->n", dx_d, dx_d) + np.einsum("ni,ni->n", d, ddx_d)
+            step = np.einsum("ni,ni->n", d, dx_d) / np.where(slope > 0, slope, np.inf)
+            k = np.clip(k - step, 0.0, 1.0)
+    normal = _unit_normals(np.einsum("nk,nki->ni", shape(k, k_d, 1), nodes), side)
     if smooth:
-        at_vertex = np.vstack([normal[:1], normal[:-1] + normal[1:], normal[-1:]])
+        ends = [_unit_normals(np.einsum("k,mki->mi", shape(np.array(end), k_d, 1), facets), side) for end in (0.0, 1.0)]
+        at_vertex = np.vstack([ends[0][:1], ends[1][:-1] + ends[0][1:], ends[1][-1:]])
         at_vertex /= np.linalg.norm(at_vertex, axis=1)[:, None]
-        w = np.clip(place, 0.0, 1.0)[:, None]
-        n = (1 - w) * at_vertex[segment] + w * at_vertex[segment + 1]
-        n /= np.linalg.norm(n, axis=1)[:, None]
-    return Pairing(segment, place, n, past)
+        normal = (1 - k[:, None]) * at_vertex[facet] + k[:, None] * at_vertex[facet + 1]
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+    return Pairing(facet, k, normal, past)
+
+
+def _unit_normals(tangents: Array, side: float) -> Array:
+    normals = side * np.stack([tangents[:, 1], -tangents[:, 0]], axis=1)
+    return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])
 
 
 def closest_rows(
-    slave_nodes: Index, N: Array, x_s: Array, die: Surface, z: Array, smooth: bool = False
+    slave_nodes: Index,
+    N: Array,
+    x_s: Array,
+    die: Surface,
+    z: Array,
+    smooth: bool = False,
+    keep: Index | None = None,
 ) -> tuple[Pairing, Array, Array, Index]:
-    """Gap to the closest point of the die's polyline, and its derivative with the normal held.
+    """Gap to the closest point of the die, and its derivative with the normal held.
 
     On a flat facet that derivative is exact: what the turning of the normal adds is proportional to the distance
     along the facet between the two points, which is zero.
@@ -430,23 +462,22 @@ def closest_rows(
         slave_nodes: Nodes behind each point, ``shape=(n, K)``.
         N: Their shape functions at the point, ``shape=(n, K)``.
         x_s: Current positions, ``shape=(n, 2)``, mm.
-        die: Die surface; a quadratic facet counts as two straight segments.
+        die: Die surface.
         z: Contact vector, mm.
         smooth: Averaged normals.
+        keep: Facets of an earlier pairing, as in `closest_points`.
 
     Returns:
-        Pairing, gap ``(n,)``, rows ``(n, 2 K + 4)`` and their columns in z.
+        Pairing, gap ``(n,)``, rows ``(n, 2 (K + k))`` and their columns in z.
     """
-    nodes = die.node_numbers
-    line = polyline_points(die) + z.reshape(-1, 2)[nodes]
-    pair = closest_points(x_s, line, die.side, smooth)
-    ends = np.stack([nodes[pair.segment], nodes[pair.segment + 1]], axis=1)
-    M = shape(pair.k, 2)
-    x_m = M[:, :1] * line[pair.segment] + M[:, 1:] * line[pair.segment + 1]
+    facets = die.X + z.reshape(-1, 2)[die.nodes]
+    pair = closest_points(x_s, facets, die.side, smooth, keep)
+    M = shape(pair.k, die.nodes.shape[1])
+    x_m = np.einsum("nk,nki->ni", M, facets[pair.facet])
     gap = np.einsum("ni,ni->n", pair.normal, x_s - x_m)
     weights = np.concatenate([N, -M], axis=1)
     G = (weights[:, :, None] * pair.normal[:, None]).reshape(len(x_s), -1)
-    return pair, gap, G, _dofs(np.concatenate([slave_nodes, ends], axis=1))
+    return pair, gap, G, _dofs(np.concatenate([slave_nodes, die.nodes[pair.facet]], axis=1))
 
 
 def polyline_points(die: Surface) -> Array:
@@ -455,8 +486,8 @@ def polyline_points(die: Surface) -> Array:
     return np.asarray(die.X.reshape(-1, 2)[first[np.searchsorted(number, die.node_numbers)]])
 
 
-def ray_gap(x: Array, die: Surface, z: Array, axis: int, sign: float) -> tuple[Array, Array]:
-    """Gap along the ray at given current positions, and the die's slope there (for reports).
+def ray_gap(x: Array, die: Surface, z: Array, axis: int, sign: float) -> tuple[Array, Array, Index, Array]:
+    """Gap along the ray at given current positions.
 
     Args:
         x: Points, ``shape=(n, 2)``, mm.
@@ -464,13 +495,20 @@ def ray_gap(x: Array, die: Surface, z: Array, axis: int, sign: float) -> tuple[A
         z: Contact vector, mm.
         axis: Component of the ray.
         sign: +1 if the die lies towards larger values of it.
+
+    Returns:
+        Gap, the die's slope, its facet and the place on it, below 0 or above 1 past the die's ends; ``shape=(n,)``.
     """
     p, c = 1 - axis, axis
     xd = die.X + z.reshape(-1, 2)[die.nodes]
-    e = np.clip(np.searchsorted(xd[:, 0, p], x[:, p], side="right") - 1, 0, len(xd) - 1)
-    place = invert(xd[e][:, :, p], x[:, p])
-    k = np.clip(place, 0.0, 1.0)
-    at = np.einsum("nk,nki->ni", shape(k, xd.shape[1]), xd[e])
-    tangent = np.einsum("nk,nki->ni", shape(k, xd.shape[1], 1), xd[e])
-    slope = np.where(place == k, tangent[:, c] / tangent[:, p], _reference_slope(die, axis)[e])
-    return sign * (at[:, c] + slope * (x[:, p] - at[:, p]) - x[:, c]), slope
+    m = len(xd)
+    facet = np.clip(np.searchsorted(xd[:, 0, p], x[:, p], side="right") - 1, 0, m - 1)
+    along = (x[:, p] - xd[facet, 0, p]) / (xd[facet, 1, p] - xd[facet, 0, p])
+    outside = (along < 0) | (along > 1)
+    target = np.where(outside, 0.5 * (xd[facet, 0, p] + xd[facet, 1, p]), x[:, p])
+    k = np.clip(np.where(outside, along, invert(xd[facet][:, :, p], target)), 0.0, 1.0)
+    at = np.einsum("nk,nki->ni", shape(k, xd.shape[1]), xd[facet])
+    tangent = np.einsum("nk,nki->ni", shape(k, xd.shape[1], 1), xd[facet])
+    slope = np.where(outside, _reference_slope(die, axis)[facet], tangent[:, c] / tangent[:, p])
+    gap = sign * (at[:, c] + slope * (x[:, p] - at[:, p]) - x[:, c])
+    return gap, slope, facet, np.where(outside, along, k)

@@ -25,7 +25,7 @@ from extrusion.errors import InputError
 from extrusion.gap import Array, Index, Surface, polyline
 from extrusion.mesh import PlainMesh, TaggedMesh, check_profile, distribute, on_root
 from extrusion.surfaces import Trace, all_ranks, gather_trace
-from extrusion.zones import ContactTerm, IntegratedContact, NodalContact, Pair, gap_at_nodes
+from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact, Pair, gap_at_nodes
 
 AXIS = {"r": 0, "y": 1}
 
@@ -164,12 +164,15 @@ class Problem:
         if zone.slave == "die":
             slave, master, material, sign = master, slave, case.die_material, -1.0
         ray = (zone.gap or ("closest" if case.method == "nodal" else "ray")) == "ray"
+        # past its ends the die goes on straight; but what a glissière without a second zone pushes past F is let go
         extended = zone.contact != "bilateral" or len(case.zones) > 1
         pair = Pair(zone.name, slave, master, AXIS[zone.ray], sign, zone.contact, ray, zone.smooth, extended)
         k = stiffness(case.contact_gamma, material.E, material.nu, slave.length)
         rest: tuple[float, bool] = (case.profile.radius, zone.initial == "interpenetrating")
         if case.method == "nodal":
             return NodalContact(pair, first, k, *rest)
+        if case.method == "mortar":
+            return MortarContact(pair, first, k, *rest)
         return IntegratedContact(pair, k, material if case.method == "nitsche" else None, case.theta, *rest)
 
     # -- layout of x, and of the contact vector z in it ------------------------------------------------------
@@ -288,11 +291,11 @@ class Problem:
         for term in self.terms:
             term.start(z)
 
-    def pair_up(self, x: PETSc.Vec) -> None:
+    def pair_up(self, x: PETSc.Vec, settle: bool = False) -> None:
         """Pair billet and die anew at x, for terms that freeze their pairing."""
         z = self.gather(x)
         for term in self.terms:
-            term.pair_up(z)
+            term.pair_up(z, settle)
 
     def accept(self, x: PETSc.Vec) -> None:
         """Make x the accepted state of every zone."""

@@ -27,6 +27,9 @@ MAX_CUTS = 8
 PASSES = 30
 """Geometry passes of one increment (nodal contact) before it is cut."""
 
+SETTLE = 3
+"""Passes after which a node that rests on a die vertex stays with the facet it had."""
+
 PASS_TOLERANCE = 0.01
 """Passes stop when the displacement increment changes by less than this part of itself (the sheet's RESI_GEOM)."""
 
@@ -63,13 +66,10 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
     problem.shift_billet(rate, 1.0)  # du/dt that predicts the next increment: rigid at first, then that of the last one
     for target in times:
         cuts = iterations = passes = 0
-        share = 1.0  # part of the remaining increment that is tried
+        dt = target - t
         while t < target:
-            dt = (target - t) * share
-            if share == 1.0 or t + dt > target:
-                goal, dt = target, target - t
-            else:
-                goal = t + dt
+            goal = target if t + 1.001 * dt >= target else t + dt
+            dt = goal - t
             x.copy(accepted)
             x.axpy(dt, rate)
             problem.drive(x, goal)
@@ -80,9 +80,10 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
                 problem.accept(x)
                 rate.waxpy(-1.0, accepted, x)
                 rate.scale(1 / dt)
-                share = min(1.0, 2 * share * dt / max(target - t, dt)) if t < target else 1.0
+                dt *= 2
                 continue
             cuts += 1
+            dt /= 2
             rate.set(0.0)
             problem.shift_billet(rate, 1.0)
             place = problem.worst(x)
@@ -93,8 +94,7 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
                     f"step to t = {goal:.6g} mm not solved after {cuts - 1} cuts: {outcome.reason}; {place}. "
                     f"{outcome.remedy}"
                 )
-            log.info("t = %.6g mm: %s; %s; cut to %.3g mm", goal, outcome.reason, place, dt / 2)
-            share = share / 2 if share < 1 else dt / 2 / (target - t)
+            log.info("t = %.6g mm: %s; %s; cut to %.3g mm", goal, outcome.reason, place, dt)
         z = problem.gather(x)
         rear, die = problem.reactions(x)
         yield Step(
@@ -131,7 +131,7 @@ def _increment(problem: Problem, newton: Newton, accepted: PETSc.Vec) -> _Attemp
     seen: list[float] = []
     previous = x.duplicate()
     for attempt in range(1, (PASSES if frozen else 1) + 1):
-        problem.pair_up(x)
+        problem.pair_up(x, settle=attempt > SETTLE)
         x.copy(previous)
         outcome = newton.solve(x)
         iterations += outcome.iterations

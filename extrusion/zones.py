@@ -42,7 +42,7 @@ class Pair:
     closure: Closure
     ray: bool  # gap along the ray (else to the closest point)
     smooth: bool  # averaged normals (closest point)
-    extended: bool  # the master's end lines go on past its ends; else a bilateral point there is let go
+    extended: bool  # the master's end lines go on past its ends; else a point there is let go
     axisymmetric: bool = True
 
     @property
@@ -73,8 +73,11 @@ class ContactTerm(Protocol):
     def start(self, z: Array) -> None:
         """Set the accepted state at t = 0 from the gap there."""
 
-    def pair_up(self, z: Array) -> None:
-        """Freeze what the term freezes of the geometry (nothing, for terms that follow it)."""
+    def pair_up(self, z: Array, settle: bool = False) -> None:
+        """Freeze what the term freezes of the geometry (nothing, for terms that follow it).
+
+        ``settle``: let points that rest on a die vertex stay with the facet they had.
+        """
 
     def add_residual(self, z: Array, R: Array) -> None:
         """Add the term's forces (N) to R."""
@@ -98,7 +101,7 @@ def closed_at_start(gap: Array, radius: float, interpenetrating: bool) -> np.nda
 class NodalContact:
     """Exact constraint at the slave nodes by an active set, one multiplier (N, whole revolution) a node.
 
-    The pairing (die segment, place and normal) is frozen by `pair_up`; between two of these the problem is a linear
+    The pairing (die facet, place and normal) is frozen by `pair_up`; between two of these the problem is a linear
     complementarity problem, and its semismooth Newton iteration a primal-dual active set (Hintermüller, Ito,
     Kunisch 2002, doi:10.1137/S1052623401383558)::
 
@@ -116,20 +119,24 @@ class NodalContact:
         self._kappa = np.full(len(self.nodes), float(np.mean(stiffness) * np.mean(np.abs(self.weight))))
         self._radius, self._interpenetrating = radius, interpenetrating
         self.closed = np.zeros(len(self.nodes), dtype=bool)
+        self._facet: Index | None = None
 
     def start(self, z: Array) -> None:
         self.pair_up(z)
         self.closed = closed_at_start(self._g0 + self._apply(z), self._radius, self._interpenetrating)
 
-    def pair_up(self, z: Array) -> None:
+    def pair_up(self, z: Array, settle: bool = False) -> None:
         pair = self.pair
         x = self.X + _displacement(z, self.nodes)
         if pair.ray:
             g, slope, self._G, self._cols, self._past = _ray_rows(pair, self.nodes, x, z)
             self._cos = 1 / np.sqrt(1 + slope**2)
         else:
-            ones = np.ones((len(x), 1))
-            found, g, self._G, self._cols = closest_rows(self.nodes[:, None], ones, x, pair.die, _even(z), pair.smooth)
+            ones, keep = np.ones((len(x), 1)), self._facet if settle else None
+            found, g, self._G, self._cols = closest_rows(
+                self.nodes[:, None], ones, x, pair.die, _even(z), pair.smooth, keep
+            )
+            self._facet = found.facet
             self._past, self._cos = found.past, np.abs(found.normal @ pair.direction)
         self._g0 = g - self._apply(z)
 
@@ -139,9 +146,8 @@ class NodalContact:
     def _law(self, z: Array) -> tuple[Array, Array, Array]:
         lam = z[self.at]
         gap = self._g0 + self._apply(z)
-        held = self.closed & ~self._past if not self.pair.extended else self.closed
-        sc, dsc = project(lam + self._kappa * gap, self.pair.closure, held)
-        if self.pair.closure == "bilateral" and not self.pair.extended:
+        sc, dsc = project(lam + self._kappa * gap, self.pair.closure, self.closed)
+        if not self.pair.extended:
             sc, dsc = np.where(self._past, 0.0, sc), np.where(self._past, 0.0, dsc)
         return gap, sc, dsc
 
@@ -219,7 +225,7 @@ class IntegratedContact:
         held = closed_at_start(self._points(z, False)[0].gap, self._radius, self._interpenetrating)
         self.closed = self._whole_facets(self._points(z, False)[0], held)
 
-    def pair_up(self, z: Array) -> None:
+    def pair_up(self, z: Array, settle: bool = False) -> None:
         pass
 
     def _whole_facets(self, points: Points, held: np.ndarray) -> np.ndarray:
@@ -258,7 +264,7 @@ class IntegratedContact:
         own = np.einsum("nql,nl->nq", S, z[points.cols]) if S is not None else np.zeros_like(points.gap)
         held = np.broadcast_to(self.closed[points.facet][:, None], own.shape)
         sc, dsc = project(own + k * points.gap, self.pair.closure, held)
-        if self.pair.closure == "bilateral" and not self.pair.extended:
+        if not self.pair.extended:
             sc, dsc = np.where(points.past, 0.0, sc), np.where(points.past, 0.0, dsc)
         return own, sc, dsc, k
 
@@ -321,23 +327,172 @@ class IntegratedContact:
     def state(self, z: Array) -> ContactState:
         points, S, _ = self._points(z, False)
         _, sc, dsc, _ = self._law(z, points, S)
-        slave = self.pair.slave
-        N = shape(points.xi, slave.nodes.shape[1])
-        x = N @ (slave.X + _displacement(z, slave.nodes))[points.facet]
-        start = np.append(0.0, np.cumsum(slave.length))
-        s = start[points.facet][:, None] + points.xi * slave.length[points.facet][:, None]
-        cos = 1 / np.sqrt(1 + points.slope**2)
-        ray, normal = (-sc, -sc / cos) if self.pair.ray else (-sc * cos, -sc)
         closed = points.gap < 0 if self.pair.closure == "check" else dsc > 0
-        return ContactState(
-            x.reshape(-1, 2),
-            s.ravel(),
-            points.gap.ravel(),
-            normal.ravel(),
-            ray.ravel(),
-            points.weight.ravel(),
-            closed.ravel(),
+        return _state_at(self.pair, z, points, sc, closed)
+
+
+class MortarContact:
+    """Weak gap against a P1 multiplier on the slave side (MPa, along the ray), an active set on its nodes.
+
+    ::
+
+        G_i = sum_q w psi_i gap;  p = sum_i psi_i lambda_i
+        residual  K u - f + sum_q w p G^T,   project(D_i lambda_i + k G_i) - D_i lambda_i,   D_i = sum_q w psi_i
+
+    with the integrals split at the die's kinks and their exact derivative, as in `IntegratedContact`. A bilateral
+    row of which less than `FACING` of the weight still faces the die is let go. Popp, Gitterle, Gee, Wall 2010,
+    doi:10.1002/nme.2866, with a standard instead of a dual basis.
+    """
+
+    FACING = 0.3
+
+    def __init__(
+        self,
+        pair: Pair,
+        first: int,
+        stiffness: Array,
+        radius: float,
+        interpenetrating: bool = False,
+        order: int = 4,
+    ) -> None:
+        self.pair, self._order, self._k = pair, order, float(np.mean(stiffness))
+        m = len(pair.slave.nodes)
+        self.multipliers = 0 if pair.closure == "check" else m + 1
+        self.at = first + np.arange(self.multipliers)
+        self._radius, self._interpenetrating = radius, interpenetrating
+        self.closed = np.zeros(m + 1, dtype=bool)
+
+    def start(self, z: Array) -> None:
+        points = self._points(z, False)
+        held = closed_at_start(points.gap, self._radius, self._interpenetrating)
+        self.closed[:] = True
+        np.logical_and.at(self.closed, points.facet, held.all(axis=1))
+        np.logical_and.at(self.closed, points.facet + 1, held.all(axis=1))
+
+    def pair_up(self, z: Array, settle: bool = False) -> None:
+        pass
+
+    def _points(self, z: Array, variation: bool) -> Points:
+        pair = self.pair
+        return ray_points(
+            pair.slave, pair.die, _even(z), pair.axis, pair.sign, self._order, pair.axisymmetric, variation
         )
+
+    def _rows(self, points: Points) -> tuple[Array, Array, Array]:
+        """Weak gap (mm^3), facing weight (mm^2) of each row, and the point weights that count."""
+        w = points.weight if self.pair.extended else np.where(points.past, 0.0, points.weight)
+        weak, facing, total = (np.zeros(len(self.closed)) for _ in range(3))
+        for node, psi in ((points.facet, 1 - points.xi), (points.facet + 1, points.xi)):
+            np.add.at(weak, node, (w * psi * points.gap).sum(axis=1))
+            np.add.at(facing, node, (w * psi).sum(axis=1))
+            np.add.at(total, node, (points.weight * psi).sum(axis=1))
+        self._share = facing / total
+        return weak, total, w
+
+    def _law(self, z: Array, points: Points) -> tuple[Array, Array, Array, Array]:
+        weak, total, w = self._rows(points)
+        sc, dsc = project(total * z[self.at] + self._k * weak, self.pair.closure, self.closed)
+        if not self.pair.extended:
+            free = self._share < self.FACING
+            sc, dsc = np.where(free, 0.0, sc), np.where(free, 0.0, dsc)
+        return sc, dsc, total, w
+
+    def add_residual(self, z: Array, R: Array) -> None:
+        if not self.multipliers:
+            return
+        points = self._points(z, False)
+        sc, _, total, w = self._law(z, points)
+        lam = z[self.at]
+        p = (1 - points.xi) * lam[points.facet, None] + points.xi * lam[points.facet + 1, None]
+        np.add.at(R, points.cols, np.einsum("nq,nql->nl", w * p, points.G))
+        R[self.at] += sc - total * lam
+
+    def tangent(self, z: Array, geometric: bool) -> Triplets:
+        if not self.multipliers:
+            return _none()
+        points = self._points(z, geometric)
+        sc, dsc, total, w = self._law(z, points)
+        lam = z[self.at]
+        f = points.facet
+        on = (dsc[f] > 0) | (dsc[f + 1] > 0) | (lam[f] != 0) | (lam[f + 1] != 0)
+        points, w, f = _take(points, on), w[on], f[on]
+        psi = np.stack([1 - points.xi, points.xi], axis=-1)
+        ends = np.stack([f, f + 1], axis=-1)
+        n, q, n_u = points.G.shape
+        p = (psi * lam[ends][:, None]).sum(axis=-1)
+        row = (self._k * dsc)[ends]
+
+        def pad(u: Array | None, multiplier: Array | None) -> Array:
+            out = np.zeros((n, q, n_u + 2))
+            if u is not None:
+                out[..., :n_u] = u
+            if multiplier is not None:
+                out[..., n_u:] = multiplier
+            return out
+
+        d_gap, weighted_row = points.G, w[..., None] * psi * row[:, None]
+        exact = geometric and points.dxi is not None
+        if points.dxi is not None and points.gap_xi is not None and exact:
+            d_gap = points.G + points.gap_xi[..., None] * points.dxi
+        left = [pad(w[..., None] * points.G, None), pad(None, weighted_row)]
+        right = [pad(None, psi), pad(d_gap, None)]
+        if exact and points.dxi is not None and points.G_xi is not None and points.dweight is not None:
+            counts = (w != 0)[..., None] * points.dweight
+            wp = (w * p)[..., None]
+            p_xi = (lam[f + 1] - lam[f])[:, None, None]
+            slope = np.array([-1.0, 1.0]) * row[:, None] * (w * points.gap)[..., None]
+            left += [
+                pad(p[..., None] * points.G, psi * row[:, None] * points.gap[..., None]),
+                pad(wp * points.G_xi + w[..., None] * p_xi * points.G, slope),
+            ]
+            right += [pad(counts, None), pad(points.dxi, None)]
+            for a, b in points.curvature:
+                left.append(pad(wp * a, None))
+                right.append(pad(b, None))
+        J = np.swapaxes(np.concatenate(left, axis=1), 1, 2) @ np.concatenate(right, axis=1)
+        cols = np.concatenate([points.cols, self.at[ends]], axis=1)
+        rows = np.broadcast_to(cols[:, :, None], J.shape)
+        across = np.broadcast_to(cols[:, None, :], J.shape)
+        return (
+            np.concatenate([rows.ravel(), self.at]),
+            np.concatenate([across.ravel(), self.at]),
+            np.concatenate([J.ravel(), (dsc - 1.0) * total]),
+        )
+
+    def accept(self, z: Array) -> None:
+        if self.multipliers and self.pair.closure == "bilateral":
+            dsc = self._law(z, self._points(z, False))[1]
+            self.closed |= dsc > 0
+            if not self.pair.extended:
+                self.closed &= self._share >= self.FACING
+
+    def state(self, z: Array) -> ContactState:
+        points = self._points(z, False)
+        stress, closed = np.zeros_like(points.gap), points.gap < 0
+        if self.multipliers:
+            lam, dsc = z[self.at], self._law(z, points)[1]
+            stress = (1 - points.xi) * lam[points.facet, None] + points.xi * lam[points.facet + 1, None]
+            closed = np.where(points.xi < 0.5, dsc[points.facet, None], dsc[points.facet + 1, None]) > 0
+        return _state_at(self.pair, z, points, stress, closed)
+
+
+def _state_at(pair: Pair, z: Array, points: Points, stress: Array, closed: np.ndarray) -> ContactState:
+    """Report at quadrature points; ``stress`` is that conjugate to the gap, MPa."""
+    slave = pair.slave
+    x = shape(points.xi, slave.nodes.shape[1]) @ (slave.X + _displacement(z, slave.nodes))[points.facet]
+    start = np.append(0.0, np.cumsum(slave.length))
+    s = start[points.facet][:, None] + points.xi * slave.length[points.facet][:, None]
+    cos = 1 / np.sqrt(1 + points.slope**2)
+    ray, normal = (-stress, -stress / cos) if pair.ray else (-stress * cos, -stress)
+    return ContactState(
+        x.reshape(-1, 2),
+        s.ravel(),
+        points.gap.ravel(),
+        normal.ravel(),
+        ray.ravel(),
+        points.weight.ravel(),
+        closed.ravel(),
+    )
 
 
 def nodal_weights(surface: Surface, axisymmetric: bool) -> Array:
@@ -384,19 +539,15 @@ def _take(points: Points, on: np.ndarray) -> Points:
 def _ray_rows(pair: Pair, nodes: Index, x: Array, z: Array) -> tuple[Array, Array, Array, Index, np.ndarray]:
     """Ray gap at nodes, the die's slope, rows and columns, and which lie past the die's ends."""
     p, c, sign, die = 1 - pair.axis, pair.axis, pair.sign, pair.die
-    xd = die.X + _displacement(z, die.nodes)
-    e = np.clip(np.searchsorted(xd[:, 0, p], x[:, p], side="right") - 1, 0, len(xd) - 1)
-    gap, slope = ray_gap(x, die, _even(z), pair.axis, sign)
-    k = (x[:, p] - xd[e, 0, p]) / (xd[e, 1, p] - xd[e, 0, p])
+    gap, slope, facet, k = ray_gap(x, die, _even(z), pair.axis, sign)
     past = (k < -1e-9) | (k > 1 + 1e-9)
-    M = shape(k, 2)
-    G = np.zeros((len(x), 6))
-    G[:, c], G[:, p] = -sign, sign * slope
-    G[:, 2 + c], G[:, 4 + c] = sign * M[:, 0], sign * M[:, 1]
-    G[:, 2 + p], G[:, 4 + p] = -sign * slope * M[:, 0], -sign * slope * M[:, 1]
-    three = np.concatenate([nodes[:, None], die.nodes[e, :2]], axis=1)
-    cols = (2 * three[..., None] + np.arange(2)).reshape(len(x), -1)
-    return gap, slope, G, cols, past
+    weights = np.concatenate([-np.ones((len(x), 1)), shape(np.clip(k, 0.0, 1.0), die.nodes.shape[1])], axis=1)
+    G = np.empty((*weights.shape, 2))
+    G[..., c] = sign * weights
+    G[..., p] = -sign * slope[:, None] * weights
+    touched = np.concatenate([nodes[:, None], die.nodes[facet]], axis=1)
+    cols = (2 * touched[..., None] + np.arange(2)).reshape(len(x), -1)
+    return gap, slope, G.reshape(len(x), -1), cols, past
 
 
 def _closest_integration_points(pair: Pair, z: Array, order: int) -> tuple[Points, Array]:
@@ -418,7 +569,7 @@ def _closest_integration_points(pair: Pair, z: Array, order: int) -> tuple[Point
     normal = found.normal
     slope = normal[:, 1 - pair.axis] / np.where(normal[:, pair.axis] == 0, 1e-300, normal[:, pair.axis])
     points = Points(
-        facet=facet, die=found.segment, cols=cols, xi=np.tile(xi, m)[:, None], weight=measure.reshape(-1, 1),
+        facet=facet, die=found.facet, cols=cols, xi=np.tile(xi, m)[:, None], weight=measure.reshape(-1, 1),
         gap=gap[:, None], G=G[:, None], slope=slope[:, None], past=found.past[:, None],
     )  # fmt: skip
     return points, -normal[:, None]
