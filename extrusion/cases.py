@@ -7,6 +7,7 @@ solved today. Reading this page should be like reading the sheet's own tables.
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import tomllib
 from collections.abc import Mapping
@@ -100,8 +101,15 @@ class Case:
     figures: tuple[Figure, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name:
-            raise InputError("name", self.name, "give the case a name")
+        if (
+            not isinstance(self.name, str)
+            or not self.name
+            or not set(self.name).isdisjoint("/\\\0")
+            or self.name[0] == "."
+        ):
+            raise InputError("name", self.name, "give the case a name that can name a folder")
+        if not isinstance(self.title, str):
+            raise InputError("title", self.title, "give a text")
         _choice("method", self.method, METHODS)
         _choice("order", self.order, (1, 2))
         _choice("theta", self.theta, (-1, 0, 1))
@@ -268,7 +276,7 @@ def _build(
 
 
 def read_toml(path: str | Path) -> Case:
-    """A case from a TOML file.
+    """A case from a TOML file; a mesh file that it names is looked for beside it.
 
     Raises:
         InputError: The file is missing, is no TOML, or does not state a case.
@@ -279,9 +287,10 @@ def read_toml(path: str | Path) -> Case:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise InputError("case file", str(path), f"cannot be read ({reason})") from None
     try:
-        return from_dict(tomllib.loads(text))
+        case = from_dict(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
         raise InputError("case file", str(path), f"is no TOML: {error}") from None
+    return case if case.mesh is None else replace(case, mesh=str(Path(path).parent / case.mesh))
 
 
 def to_toml(case: Case) -> str:
@@ -312,7 +321,7 @@ def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_toml(item) for item in value) + "]"
     return repr(value)

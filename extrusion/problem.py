@@ -7,6 +7,7 @@ rank computes whole from the gathered surfaces, and of which it keeps those it o
 
 from __future__ import annotations
 
+from functools import cached_property
 from itertools import pairwise
 
 from mpi4py import MPI
@@ -68,11 +69,17 @@ class Problem:
         self.K.assemble()
 
     def stress_fields(self, x: PETSc.Vec) -> dict[str, fem.Function]:
-        """Displacement (mm) and von Mises stress (MPa, cell means on DG0) as DOLFINx functions."""
-        u = fem.Function(self.V, name="displacement")
+        """Displacement (mm) and von Mises stress (MPa, one a cell) at x: the same two functions at each call."""
+        u, mises, expression = self._fields
         u.x.array[: self._owned] = x.array_r[: self._owned]
         u.x.scatter_forward()
+        mises.interpolate(expression)
+        return {"displacement": u, "von_mises": mises}
+
+    @cached_property
+    def _fields(self) -> tuple[fem.Function, fem.Function, fem.Expression]:
         msh, groups = self.tagged.msh, self.tagged.groups
+        u = fem.Function(self.V, name="displacement")
         DG0 = fem.functionspace(msh, ("DG", 0))
         lame = {name: fem.Function(DG0) for name in ("lmbda", "mu")}
         for body in self.bodies:
@@ -81,9 +88,8 @@ class Problem:
                 f.x.array[cells] = getattr(self._materials[body], name)
         position = ufl.SpatialCoordinate(msh)
         stress = sigma(epsilon(u, position, axisymmetric=True), lame["lmbda"], lame["mu"])
-        mises = fem.Function(DG0, name="von_mises")
-        mises.interpolate(fem.Expression(von_mises(stress), DG0.element.interpolation_points))
-        return {"displacement": u, "von_mises": mises}
+        expression = fem.Expression(von_mises(stress), DG0.element.interpolation_points)
+        return u, fem.Function(DG0, name="von_mises"), expression
 
     # -- supports --------------------------------------------------------------------------------------------
 

@@ -68,7 +68,7 @@ def gather_trace(V: Any, facets: Index, base: int) -> Trace:
         number = int(np.flatnonzero(to_facet.links(cell) == facet)[0])
         local = np.sort(layout.entity_closure_dofs(tdim - 1, number))
         dofs = dofmap.cell_dofs(cell)
-        vertices = msh.geometry.x[msh.geometry.dofmap[cell]][:3, :2]
+        vertices = msh.geometry.x[msh.geometry.dofmaps[0][cell]][:3, :2]
         start, end = (i for i in range(3) if i != number)
         inward = vertices[number] - vertices[start]
         t = vertices[end] - vertices[start]

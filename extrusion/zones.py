@@ -411,7 +411,7 @@ class MortarContact:
         if not self.multipliers:
             return _none()
         points = self._points(z, geometric)
-        sc, dsc, total, w = self._law(z, points)
+        _, dsc, total, w = self._law(z, points)
         lam = z[self.at]
         f = points.facet
         on = (dsc[f] > 0) | (dsc[f + 1] > 0) | (lam[f] != 0) | (lam[f + 1] != 0)

@@ -333,9 +333,7 @@ def test_distributed_groups_have_their_measures(bodies: tuple[str, ...]) -> None
                 count = comm.allreduce(len(tags.find(tagged.groups[name])))
                 assert count == len((mesh.cells if kind == "dx" else mesh.facets)[name]), name
         assert msh.geometry.dim == 2
-        assert msh.topology.index_map(0).size_global == len(
-            np.unique(np.vstack([mesh.cells[b] for b in bodies]))
-        )
+        assert msh.topology.index_map(0).size_global == len(np.unique(np.vstack([mesh.cells[b] for b in bodies])))
 
 
 @pytest.mark.mpi

@@ -107,9 +107,7 @@ def test_foreign_venv_is_left_alone(bare: Path) -> None:
         ({"fenics-dolfinx": "0.110.0"}, "DOLFINx = 'fenics-dolfinx 0.110.0': install DOLFINx 0.11"),
     ],
 )
-def test_dolfinx_missing_or_other(
-    monkeypatch: pytest.MonkeyPatch, installed: dict[str, str], told: str
-) -> None:
+def test_dolfinx_missing_or_other(monkeypatch: pytest.MonkeyPatch, installed: dict[str, str], told: str) -> None:
     def version(name: str) -> str:
         if name not in installed:
             raise importlib.metadata.PackageNotFoundError(name)

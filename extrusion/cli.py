@@ -1,0 +1,353 @@
+"""The command ``extrusion``.
+
+Exit codes: 0 done, 1 a step could not be solved or a figure is out, 2 bad input. DOLFINx is imported by the commands
+that need it, so that help and lists are quick.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+import extrusion
+from extrusion.cases import CASES, METHODS, Case, read_toml
+from extrusion.contact import CLOSURES
+from extrusion.errors import InputError
+
+if TYPE_CHECKING:
+    from extrusion.problem import Problem
+    from extrusion.result import Observer, Result
+    from extrusion.stepping import Step
+
+app = typer.Typer(
+    name="extrusion",
+    help="An elastic billet pushed through a die: large-sliding contact on FEniCSx.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+CaseName = Annotated[str, typer.Argument(metavar="CASE|FILE.toml", help="A case of `extrusion list`, or a file.")]
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(extrusion.__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command("list")
+def list_cases() -> None:
+    """List the built-in cases."""
+    table = Table(box=SIMPLE_HEAD, padding=0)
+    for name in ("case", "title", "t up to\nmm", "figures"):
+        table.add_column(name)
+    for case in CASES.values():
+        table.add_row(case.name, case.title, f"{case.end:g}", str(len(case.figures)))
+    Console().print(table)
+
+
+@app.command()
+def run(
+    case: CaseName,
+    method: Annotated[str | None, typer.Option(metavar="|".join(METHODS), help="How contact is written.")] = None,
+    order: Annotated[int | None, typer.Option(metavar="1|2", help="Order of the displacements.")] = None,
+    die: Annotated[str | None, typer.Option(metavar="elastic|rigid")] = None,
+    contact: Annotated[
+        str | None,
+        typer.Option(metavar="|".join(CLOSURES), help="Contact in every zone; check only reports it."),
+    ] = None,
+    size: Annotated[
+        float | None, typer.Option(metavar="MM", help="Element size on the billet's side of a graded mesh.")
+    ] = None,
+    mesh: Annotated[Path | None, typer.Option(metavar="FILE", help="Mesh (.msh, .med) in place of the case's.")] = None,
+    increment: Annotated[
+        float | None, typer.Option(metavar="MM", help="Uniform increment, in place of the case's table.")
+    ] = None,
+    until: Annotated[float | None, typer.Option(metavar="MM", help="Last t; by default the case's.")] = None,
+    gamma: Annotated[float | None, typer.Option(help="Dimensionless contact stiffness.")] = None,
+    theta: Annotated[int | None, typer.Option(metavar="-1|0|1", help="Variant of Nitsche's method.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for files; by default results/CASE.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write the result as one JSON object; - is stdout.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
+) -> None:
+    """Run a case; write tables, fields and pictures."""
+    changes = dict(
+        method=method, order=order, die=die, contact=contact, size=size, mesh=mesh, increment=increment,
+        until=until, gamma=gamma, theta=theta,
+    )  # fmt: skip
+    given = {name for name, value in changes.items() if value is not None}
+    logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, format="extrusion: %(message)s")
+    with _as_options(given | {"out", "json"}):
+        from extrusion.result import changed
+        from extrusion.result import run as solve
+
+        scene = changed(_load(case), **{**changes, "mesh": str(mesh) if mesh else None})
+        out = _default_folder(scene) if out is None else out
+        to_stdout = json_file == Path("-")
+        if json_file and not to_stdout:
+            _check_writable("json", json_file)
+        _warn_of_ranks()
+        with _progress(scene, quiet) as observers:
+            result = solve(scene, out=out, observers=observers)
+        if json_file and _rank() == 0:
+            _write_json(result, None if to_stdout else json_file)
+    if not quiet and _rank() == 0:
+        console = Console(stderr=to_stdout)
+        console.print(result.table())
+        console.print(f"Files are in {out}", soft_wrap=True, highlight=False)
+    if not result.converged:
+        _say(f"{result.error} (accepted steps are kept in {out})")
+        raise typer.Exit(1)
+
+
+@app.command()
+def verify(
+    cases: Annotated[
+        list[str] | None, typer.Argument(metavar="[CASE|FILE.toml]...", help="By default all of `extrusion list`.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+) -> None:
+    """Run cases as the sheet states them, and compare with its figures."""
+    from extrusion import result
+
+    table = Table(box=SIMPLE_HEAD, padding=0)
+    for name in (
+        "case",
+        "contact",
+        "t\nmm",
+        "figure",
+        "sheet\nmm",
+        "computed\nmm",
+        "difference\n%",
+        "tolerance\n%",
+        "",
+    ):
+        table.add_column(name, justify="left" if name in ("case", "contact", "figure", "") else "right")
+    _warn_of_ranks()
+    errors, ok = [], True
+    for case in [_load(name) for name in cases] if cases else CASES.values():
+        with _progress(case, quiet) as observers:
+            results = result.verify(case, observers=observers)
+        for one in results:
+            if one.error:
+                errors.append(f"{case.name}: {one.error}")
+            for row in one.figures():
+                ok &= row.ok
+                figure = row.figure
+                table.add_row(
+                    *(case.name, figure.contact, f"{figure.t:g}", f"{figure.quantity}({figure.point})"),
+                    *(
+                        f"{figure.value:.3f}",
+                        f"{row.computed:.4f}",
+                        f"{100 * row.difference:+.3f}",
+                        f"{100 * figure.tolerance:g}",
+                    ),
+                    "[green]ok[/]" if row.ok else "[red]out[/]",
+                )
+    if _rank() == 0:
+        Console().print(table)
+    for error in errors:
+        _say(error)
+    if errors or not ok:
+        raise typer.Exit(1)
+
+
+@app.command()
+def plot(folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a run.")]) -> None:
+    """Draw the pictures of a run anew, from its files."""
+    from extrusion import plots
+
+    if _rank() == 0:
+        for path in plots.write(plots.Record.read(folder), folder):
+            print(path)
+
+
+@app.command()
+def mesh(
+    case: CaseName = "A",
+    size: Annotated[
+        float | None, typer.Option(metavar="MM", help="Element size on the billet's side; else the case's divisions.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE.msh", help="By default CASE.msh.")] = None,
+) -> None:
+    """Mesh a case with gmsh."""
+    with _as_options({"size"}):
+        from extrusion.result import changed
+
+        scene = changed(_load(case), size=size)
+    from extrusion.check import require_dolfinx
+
+    require_dolfinx()
+    from extrusion.mesh import graded_mesh, sheet_mesh, write_mesh
+
+    path = Path(f"{_default_folder(scene).name}.msh") if out is None else out
+    if _rank() == 0:
+        made = sheet_mesh(scene.profile) if scene.size is None else graded_mesh(scene.profile, scene.size)
+        write_mesh(path, made)
+        print(f"{path}: {len(made.points)} nodes, {sum(map(len, made.cells.values()))} triangles")
+
+
+def main(args: Sequence[str] | None = None) -> NoReturn:
+    """Run the command line and exit; on several ranks, an unexpected error of one ends all.
+
+    Args:
+        args: What follows the command's name; by default what the shell gave.
+    """
+    try:
+        command = typer.main.get_command(app)
+        status = command.main(None if args is None else [*args], prog_name="extrusion", standalone_mode=False)
+        sys.exit(status if isinstance(status, int) else 0)
+    except InputError as error:
+        _say(str(error))
+        sys.exit(2)
+    except typer.TyperException as error:
+        _say(error.format_message())
+        sys.exit(2)
+    except typer.Abort:
+        _say("interrupted")
+        sys.exit(130)
+    except Exception:
+        MPI = getattr(sys.modules.get("mpi4py.MPI"), "COMM_WORLD", None)
+        if MPI is None or MPI.size == 1:
+            raise
+        traceback.print_exc()
+        sys.stderr.flush()
+        MPI.Abort(1)
+        raise
+
+
+def _say(message: str) -> None:
+    """One line on stderr, from rank 0."""
+    if message and _rank() == 0:
+        print("extrusion:", " ".join(message.split()), file=sys.stderr)
+
+
+def _rank() -> int:
+    """This process's rank; before MPI is loaded, as its launcher says."""
+    if mpi := sys.modules.get("mpi4py.MPI"):
+        return int(mpi.COMM_WORLD.rank)
+    launchers = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK")
+    return int(next((os.environ[name] for name in launchers if name in os.environ), 0))
+
+
+def _load(name: str) -> Case:
+    """A built-in case, or that of a TOML file."""
+    if name in CASES:
+        return CASES[name]
+    if not name.endswith(".toml"):
+        raise InputError("CASE", name, f"unknown case: give one of {', '.join(CASES)}, or a file that ends in .toml")
+    try:
+        return read_toml(name)
+    except InputError as error:
+        if error.field == "case file":
+            raise
+        raise InputError(f"{name}: {error.field}", error.value, error.remedy) from None
+
+
+def _default_folder(case: Case) -> Path:
+    return Path("results") / case.name
+
+
+@contextmanager
+def _as_options(given: set[str]) -> Iterator[None]:
+    """Bad values of fields that stand on the command line are told by their options."""
+    try:
+        yield
+    except InputError as error:
+        name = error.field.rsplit(".", 1)[-1]
+        if name not in given or ": " in error.field:
+            raise
+        raise InputError(f"--{name}", error.value, error.remedy) from None
+
+
+def _check_writable(field: str, path: Path) -> None:
+    """Refuse, before a long run, a file that could not be written after it."""
+    folder = path.parent
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    if path.is_dir() or not folder.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
+        raise InputError(field, str(path), "cannot be written; give another file")
+
+
+def _write_json(result: Result, path: Path | None) -> None:
+    text = json.dumps(result.to_dict(), allow_nan=False) + "\n"
+    if path is None:
+        sys.stdout.write(text)
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError("json", str(path), f"cannot be written ({error.strerror})") from None
+
+
+def _warn_of_ranks() -> None:
+    """Say so if there are more ranks on this machine than cores: MPICH busy-waits."""
+    from extrusion.check import require_dolfinx
+
+    require_dolfinx()
+    from mpi4py import MPI
+
+    here, cores = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).size, os.cpu_count() or 1
+    if here > cores:
+        _say(f"{here} ranks on {cores} cores wait for one another; use at most {cores}")
+
+
+@contextmanager
+def _progress(case: Case, quiet: bool) -> Iterator[list[Observer]]:
+    """Observers that show t, iterations and K on rank 0: a bar on a terminal, else about ten lines."""
+    if quiet or _rank() != 0:
+        yield []
+        return
+    console = Console(stderr=True)
+    iterations, last, told = 0, 0.0, 0.0
+
+    def text(step: Step) -> str:
+        nonlocal iterations, last, told
+        if step.t <= last:  # another run of the case
+            iterations, told = 0, 0.0
+        iterations, last = iterations + step.iterations, step.t
+        u_y = step.points["K"][1]
+        return f"{case.name}: t = {step.t:g} of {case.end:g} mm, {iterations} iterations, u_y(K) = {u_y:.3f} mm"
+
+    if not console.is_terminal:
+
+        def log(problem: Problem, step: Step) -> None:
+            nonlocal told
+            line = text(step)
+            if step.t >= min(told + case.end / 10, case.end):
+                told = step.t
+                _say(line)
+
+        yield [log]
+        return
+    columns: list[Any] = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(case.name, total=case.end)
+        yield [lambda problem, step: progress.update(task, completed=step.t, description=text(step))]

@@ -1,0 +1,260 @@
+"""Pictures of a run, drawn from a `Result` or from the files it left. matplotlib is imported when one is drawn."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+
+from extrusion.cases import Case, from_dict
+from extrusion.errors import InputError
+from extrusion.result import PICTURED, Array, Result, Snapshots
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Kind = Literal["billet", "history", "pressure"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+
+@dataclass(frozen=True)
+class Record:
+    """What the pictures show of a run."""
+
+    case: Case
+    t: Array  # (steps,) mm
+    u_y_K: Array  # (steps,) mm
+    reaction: Array  # (steps,) N
+    pressure: dict[float, tuple[Array, Array]]  # t -> y (mm) and pressure (MPa) along the side
+    snapshots: Snapshots | None
+
+    @classmethod
+    def of(cls, result: Result) -> Record:
+        """The record of a run, on rank 0."""
+        zone = _side_zone(result.case)
+        pressure = {}
+        for step in result.steps:
+            if zone in step.zones:
+                state = step.zones[zone]
+                pressure[step.t] = state.x[:, 1], state.pressure
+        return cls(result.case, result.t, result.point("K")[:, 1], result.reaction, pressure, result.snapshots)
+
+    @classmethod
+    def read(cls, folder: str | Path) -> Record:
+        """The record that a run left in a folder.
+
+        Raises:
+            InputError: A file is missing or is not what a run writes.
+        """
+        folder = Path(folder)
+        try:
+            with (folder / "run.json").open(encoding="utf-8") as file:
+                case = from_dict(tomllib.loads(json.load(file)["toml"]))
+            with (folder / "history.csv").open(encoding="utf-8", newline="") as file:
+                rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
+            t, u_y_K, reaction = (np.array([row[k] for row in rows]) for k in ("t", "u_y_K", "reaction"))
+            points: dict[float, list[tuple[float, float]]] = {}
+            zone = _side_zone(case)
+            if rows:
+                with (folder / "contact.csv").open(encoding="utf-8", newline="") as file:
+                    for row in csv.DictReader(file):
+                        if row["zone"] == zone:
+                            points.setdefault(float(row["t"]), []).append((float(row["y"]), float(row["pressure"])))
+            snapshots = None
+            if (folder / "snapshots.npz").exists():
+                with np.load(folder / "snapshots.npz") as data:
+                    snapshots = Snapshots(**data)
+        except FileNotFoundError as error:
+            raise InputError(
+                "DIR", str(folder), f"no {Path(error.filename).name} there; give a folder of extrusion run"
+            ) from None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError("DIR", str(folder), f"not what extrusion run writes ({error!r}); run again") from None
+        pressure = {t: (a[:, 0], a[:, 1]) for t, a in ((t, np.array(rows)) for t, rows in points.items())}
+        return cls(case, t, u_y_K, reaction, pressure, snapshots)
+
+
+def _side_zone(case: Case) -> str:
+    """Name of the zone along the billet's side, or of the first."""
+    return next((zone.name for zone in case.zones if zone.billet == "side"), case.zones[0].name)
+
+
+def write(record: Record, folder: str | Path) -> list[Path]:
+    """Draw every kind of picture there is data for, as PNG.
+
+    Raises:
+        InputError: matplotlib is missing, the folder cannot be written, or there is no step to draw.
+    """
+    paths = []
+    for kind in KINDS:
+        if kind == "billet" and record.snapshots is None:
+            continue
+        path = Path(folder) / f"{kind}.png"
+        figure = draw(record, kind)
+        try:
+            figure.savefig(path, dpi=150)
+        except OSError as error:
+            raise InputError("out", str(path), f"cannot be written ({error.strerror})") from None
+        paths.append(path)
+    return paths
+
+
+def draw(record: Record, kind: Kind) -> Figure:
+    """One picture, without touching matplotlib's global state or a display.
+
+    Raises:
+        InputError: The kind is unknown, matplotlib is missing, or there is no step to draw.
+    """
+    painters: dict[str, Callable[[Record], Figure]] = {
+        "billet": billet,
+        "history": history,
+        "pressure": pressure,
+    }
+    if kind not in painters:
+        raise InputError("kind", kind, f"choose one of {', '.join(KINDS)}")
+    if not len(record.t):
+        raise InputError("steps", 0, "there is no accepted step to draw")
+    try:
+        return painters[kind](record)
+    except ImportError:
+        raise InputError("matplotlib", "not installed", 'pip install "extrusion[plot]"') from None
+
+
+def billet(record: Record) -> Figure:
+    """The deformed billet in the die, mirrored about the axis, coloured by von Mises stress (cell means)."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import Normalize
+
+    snapshots = record.snapshots
+    if snapshots is None:
+        raise InputError("snapshots", None, "only rank 0 has them, and only after a step")
+    order = np.argsort(snapshots.t)
+    profile = record.case.profile
+    outline = np.array([vertex[1:] for vertex in profile.die])
+    rim, top = outline.max(axis=0)
+    bottom = min(0.0, outline[:, 1].min())
+    n = len(order)
+    height = 5.2
+    width = height * 0.8 * 2 * rim / (top - bottom)
+    figure = _figure(record, n * width + 2.2, height)
+    axes = figure.subplots(1, n, sharey=True, squeeze=False)[0]
+    stress = snapshots.von_mises[:, snapshots.billet]
+    norm = Normalize(0.0, max(_most(stress, snapshots), 1e-6 * record.case.billet.E))
+    cells = None
+    for ax, i in zip(axes, order, strict=True):
+        x = snapshots.points + snapshots.displacement[i]
+        die = [outline] if snapshots.billet.all() else x[snapshots.triangles[~snapshots.billet]]
+        body = x[snapshots.triangles[snapshots.billet]]
+        for side in (1, -1):
+            mirror = np.array([side, 1])
+            ax.add_collection(
+                PolyCollection([p * mirror for p in die], facecolor="0.75", edgecolor="0.75", linewidth=0.3)
+            )
+            cells = PolyCollection(
+                body * mirror, array=stress[i], cmap="turbo", norm=norm, edgecolor="face", linewidth=0.3
+            )
+            ax.add_collection(cells)
+        ax.axvline(0, color="0.2", linewidth=0.6, dashes=(12, 3, 2, 3))
+        ax.set(xlim=(-rim, rim), ylim=(bottom, top), aspect="equal", xlabel="r [mm]")
+        ax.set_title(f"t = {snapshots.t[i]:g} mm", fontsize="medium")
+        ax.tick_params(direction="out", top=False, right=False)
+    axes[0].set_ylabel("y [mm]")
+    peak = f"von Mises stress [MPa], peak {stress.max():.4g}"
+    figure.colorbar(cells, ax=axes, label=peak, shrink=0.9, pad=0.02, extend="max")
+    return figure
+
+
+def _most(stress: Array, snapshots: Snapshots) -> float:
+    """What 99.5 % of the billet's section stay below: the peaks at L and at the die's corners are singular."""
+    x = snapshots.points[snapshots.triangles[snapshots.billet]]
+    u, v = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
+    area = np.broadcast_to(np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]), stress.shape).ravel()
+    order = np.argsort(stress, axis=None)
+    below = np.cumsum(area[order])
+    return float(stress.ravel()[order[np.searchsorted(below, 0.995 * below[-1])]])
+
+
+def history(record: Record) -> Figure:
+    """Reaction on the rear face, and how far K is ahead of it, against t; the sheet's figures as marks."""
+    from matplotlib.ticker import ScalarFormatter
+
+    figure = _figure(record, 7, 5.6)
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    top.axhline(0, color="0.6", linewidth=0.8)
+    top.plot(record.t, record.reaction / 1e6, ".-", color="C0")
+    top.set_yscale("symlog", linthresh=1.0)  # some tenths of MN in the bore, tens on the cone
+    top.yaxis.set_major_formatter(ScalarFormatter())
+    top.set_ylabel("reaction on the rear face [MN]")
+    bottom.axhline(0, color="0.6", linewidth=0.8)
+    bottom.plot(record.t, record.u_y_K - record.t, ".-", color="C0", label="computed")
+    checked = all(zone.contact == "check" for zone in record.case.zones)
+    wanted = "check" if checked else "solved"
+    sheet = [
+        (f.t, f.value - f.t, f.tolerance * abs(f.value))
+        for f in record.case.figures
+        if (f.point, f.quantity, f.contact) == ("K", "u_y", wanted) and f.t <= record.t[-1]
+    ]
+    if sheet:
+        t, value, tolerance = zip(*sheet, strict=True)
+        bottom.errorbar(
+            t, value, tolerance, fmt="o", mfc="none", color="C3", capsize=3, label="sheet, with its tolerance"
+        )
+        bottom.legend(frameon=False)
+    bottom.set(xlabel="t, displacement of the rear face [mm]", ylabel="u$_y$(K) - t [mm]")
+    for ax in (top, bottom):
+        ax.grid(alpha=0.25)
+        ax.margins(x=0.02)
+    return figure
+
+
+def pressure(record: Record) -> Figure:
+    """Contact pressure along the billet's side, normal to the die, at the pictured t; the die's vertices as lines."""
+    profile = record.case.profile
+    figure = _figure(record, 8, 4.2)
+    ax = figure.subplots()
+    times = (
+        sorted({min(record.pressure, key=lambda t: abs(t - target)) for target in PICTURED}) if record.pressure else []
+    )
+    for i, t in enumerate(times):
+        y, p = record.pressure[t]
+        ax.plot(y, p, ".-", color=f"C{i}", markersize=4, linewidth=1, label=f"t = {t:g} mm")
+    for name in profile.bore:
+        y_vertex = profile.points[name][1]
+        ax.axvline(y_vertex, color="0.75", linewidth=0.8, zorder=0)
+        ax.annotate(
+            name,
+            (y_vertex, 1),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="center",
+            color="0.4",
+        )
+    ax.set(xlabel="y [mm]", ylabel="contact pressure on the side [MPa]")
+    ax.grid(alpha=0.25, axis="y")
+    if times:
+        ax.legend(frameon=False)
+    return figure
+
+
+def _figure(record: Record, width: float, height: float) -> Figure:
+    """An empty figure (inches) outside pyplot, with the run as its title; a notebook shows it."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    case = record.case
+    figure.suptitle(f"Case {case.name}: {case.method}, P{case.order}, {case.die} die", fontsize="medium")
+
+    def png() -> bytes:
+        figure.savefig(buffer := io.BytesIO(), format="png")
+        return buffer.getvalue()
+
+    figure._repr_png_ = png
+    return figure

@@ -1,0 +1,386 @@
+"""A case run from its first increment to its last, and what comes back.
+
+This module imports neither DOLFINx nor PETSc until `run` is called.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import math
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from extrusion.cases import Case, Figure
+from extrusion.check import require_dolfinx
+from extrusion.contact import CLOSURES
+from extrusion.errors import InputError, StepError
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from matplotlib.figure import Figure as Picture
+    from rich.table import Table
+
+    from extrusion.mesh import PlainMesh
+    from extrusion.problem import Problem
+    from extrusion.stepping import Step
+
+Array = NDArray[np.float64]
+Observer = Callable[["Problem", "Step"], None]
+"""Called on every rank after each accepted step; a ``close()``, if it has one, is called at the end of the run."""
+
+PICTURED = (20.0, 70.0, 155.0)
+"""The t (mm) of the sheet's pictures."""
+
+
+@dataclass(frozen=True)
+class Snapshots:
+    """The scene at a few t, for pictures. Straight-sided triangles, also where displacements are quadratic."""
+
+    points: Array  # (n, 2) reference positions (r, y), mm
+    triangles: NDArray[np.int64]  # (m, 3)
+    billet: NDArray[np.bool_]  # (m,) the triangle is the billet's, not the die's
+    t: Array  # (k,) mm
+    displacement: Array  # (k, n, 2) mm
+    von_mises: Array  # (k, m) cell means, MPa
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A figure of the sheet beside the computed one."""
+
+    figure: Figure
+    computed: float  # mm; NaN if the run has no step there
+
+    @property
+    def difference(self) -> float:
+        """Relative to the sheet's value."""
+        return (self.computed - self.figure.value) / abs(self.figure.value)
+
+    @property
+    def ok(self) -> bool:
+        """Within the tolerance."""
+        return abs(self.difference) <= self.figure.tolerance
+
+
+@dataclass(frozen=True)
+class Result:
+    """A run: its accepted steps, in order, and what it took. The same on every rank, but for `snapshots`."""
+
+    case: Case
+    steps: list[Step] = field(repr=False)  # their live x is dropped
+    dofs: int  # displacements of both bodies, fixed ones included, and multipliers
+    contact_points: int  # in all zones, at the end
+    ranks: int
+    converged: bool
+    error: str | None  # why the run stopped early
+    seconds: dict[str, float]  # setup, solve, output
+    snapshots: Snapshots | None = field(repr=False, compare=False)  # rank 0; None without accepted steps
+
+    @property
+    def t(self) -> Array:
+        """Displacement of the rear face, mm, ``shape=(steps,)``."""
+        return np.array([step.t for step in self.steps])
+
+    @property
+    def reaction(self) -> Array:
+        """Axial force on the rear face, N, whole revolution, ``shape=(steps,)``."""
+        return np.array([step.reaction for step in self.steps])
+
+    @property
+    def energy(self) -> Array:
+        """Elastic energy, N mm, ``shape=(steps,)``."""
+        return np.array([step.energy for step in self.steps])
+
+    @property
+    def iterations(self) -> NDArray[np.int64]:
+        """Linear solves, over all passes and cuts, ``shape=(steps,)``."""
+        return np.array([step.iterations for step in self.steps], dtype=np.int64)
+
+    def point(self, name: str) -> Array:
+        """Displacement (u_r, u_y) of a named point, mm, ``shape=(steps, 2)``."""
+        return np.array([step.points[name] for step in self.steps]).reshape(-1, 2)
+
+    def gap(self, name: str) -> Array:
+        """Gap at a named slave point, mm, ``shape=(steps,)``."""
+        return np.array([step.gap[name] for step in self.steps])
+
+    def figures(self) -> list[Comparison]:
+        """The sheet's figures for contact as this run has it (solved, or only checked)."""
+        checked = all(zone.contact == "check" for zone in self.case.zones)
+        rows = []
+        for figure in self.case.figures:
+            if (figure.contact == "check") is not checked:
+                continue
+            computed = math.nan
+            for step in self.steps:
+                if math.isclose(step.t, figure.t, rel_tol=1e-9):
+                    known = step.gap.get(figure.point) if figure.quantity == "gap" else step.points[figure.point][1]
+                    computed = math.nan if known is None else known
+            rows.append(Comparison(figure, computed))
+        return rows
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``--json`` writes: mm, N, N mm; a value that is not finite becomes None."""
+        return {
+            "case": self.case.name,
+            "method": self.case.method,
+            "order": self.case.order,
+            "die": self.case.die,
+            "dofs": self.dofs,
+            "contact_points": self.contact_points,
+            "ranks": self.ranks,
+            "converged": self.converged,
+            "seconds": dict(self.seconds),
+            "steps": [
+                {
+                    "t": step.t,
+                    "points": {name: [_finite(value) for value in u] for name, u in step.points.items()},
+                    "reaction": _finite(step.reaction),
+                    "energy": _finite(step.energy),
+                    "iterations": step.iterations,
+                    "cuts": step.cuts,
+                    "gap": {name: _finite(value) for name, value in step.gap.items()},
+                }
+                for step in self.steps
+            ],
+        }
+
+    def table(self) -> Table:
+        """A short table for the terminal: about ten steps, among them those with a figure of the sheet."""
+        from rich.box import SIMPLE_HEAD
+        from rich.table import Table
+
+        header, rows = self._rows(self._chosen())
+        table = Table(
+            title=self._title(), caption=self._caption(), box=SIMPLE_HEAD, padding=0,
+            title_justify="left", caption_justify="left", title_style="bold", caption_style="",
+        )  # fmt: skip
+        for name in header:
+            table.add_column(name.replace(" ", "\n"), justify="right")
+        for row in rows:
+            table.add_row(*row)
+        return table
+
+    def _repr_html_(self) -> str:
+        header, rows = self._rows(range(len(self.steps)))
+        head = "".join(f"<th>{html.escape(name)}</th>" for name in header)
+        body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+        title, caption = html.escape(self._title()), html.escape(self._caption())
+        return f"<p>{title}</p><table><tr>{head}</tr>{body}</table><p>{caption}</p>"
+
+    def plot(self, kind: Literal["billet", "history", "pressure"] = "billet") -> Picture:
+        """A picture: the deformed billet in the die, reaction and K against t, or the pressure along the side.
+
+        Raises:
+            InputError: matplotlib is missing, or there is nothing to draw yet.
+        """
+        from extrusion import plots
+
+        return plots.draw(plots.Record.of(self), kind)
+
+    def _title(self) -> str:
+        case, ranks = self.case, "1 rank" if self.ranks == 1 else f"{self.ranks} ranks"
+        return f"{case.name}: {case.method}, P{case.order}, {case.die} die, {self.dofs} dofs, {ranks}"
+
+    def _caption(self) -> str:
+        end = "converged" if self.converged else f"stopped: {self.error}"
+        return f"{end}; " + ", ".join(f"{name} {value:.2f} s" for name, value in self.seconds.items())
+
+    def _chosen(self) -> list[int]:
+        last = len(self.steps) - 1
+        tested = {comparison.figure.t for comparison in self.figures()}
+        chosen = {i for i, step in enumerate(self.steps) if step.t in tested}
+        if len(chosen) < 3:
+            chosen |= {int(i) for i in np.linspace(0, last, 10).round()} if last >= 0 else set()
+        return sorted(chosen | {last} - {-1})
+
+    def _rows(self, chosen: Sequence[int]) -> tuple[list[str], list[list[str]]]:
+        figures = {c.figure.t: c for c in self.figures() if (c.figure.point, c.figure.quantity) == ("K", "u_y")}
+        gaps = [name for name in ("L", "M") if self.steps and name in self.steps[0].gap]
+        header = ["t mm", "u_y(K) mm", *(["sheet mm", "diff. %"] if figures else []), "reaction kN", "energy J"]
+        header += [*(f"gap({name}) mm" for name in gaps), "iterations", "cuts"]
+        rows = []
+        for step in (self.steps[i] for i in chosen):
+            row = [f"{step.t:g}", f"{step.points['K'][1]:.3f}"]
+            if figures:
+                c = figures.get(step.t)
+                row += ["", ""] if c is None else [f"{c.figure.value:.3f}", f"{100 * c.difference:+.3f}"]
+            row += [_fixed(step.reaction / 1e3, 2), _fixed(step.energy / 1e3, 2)]
+            row += [_fixed(step.gap[name], 3) for name in gaps]
+            rows.append([*row, str(step.iterations), str(step.cuts)])
+        return header, rows
+
+
+def _fixed(value: float, digits: int) -> str:
+    return f"{round(value, digits) + 0.0:.{digits}f}"  # no -0.000
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def changed(case: Case, **changes: Any) -> Case:
+    """The case with some fields changed; those at None are left as they are.
+
+    Args:
+        case: What to start from.
+        **changes: Fields of `Case`, and ``contact``, ``increment``, ``until`` as in its ``with_contact`` and
+            ``with_increment``. A size takes the place of the case's mesh file, and a mesh file of its size.
+
+    Raises:
+        InputError: A value is out of range, or both a size and a mesh file are given.
+    """
+    changes = {name: value for name, value in changes.items() if value is not None}
+    if "size" in changes and "mesh" in changes:
+        raise InputError("size", changes["size"], "a mesh file has its own element size: give one or the other")
+    contact, increment, until = (changes.pop(name, None) for name in ("contact", "increment", "until"))
+    if contact is not None:
+        if contact not in CLOSURES:
+            raise InputError("contact", contact, f"choose one of {', '.join(CLOSURES)}")
+        case = case.with_contact(contact)
+    if increment is not None or until is not None:
+        case = case.with_increment(increment, until)
+    if "size" in changes or "mesh" in changes:
+        changes = {"size": None, "mesh": None, **changes}
+    return dataclasses.replace(case, **changes) if changes else case
+
+
+def run(
+    case: Case,
+    *,
+    mesh: str | Path | PlainMesh | None = None,
+    comm: MPI.Intracomm | None = None,
+    observers: Sequence[Observer] = (),
+    out: str | Path | None = None,
+    **changes: Any,
+) -> Result:
+    """Solve a case. Collective.
+
+    Args:
+        case: The scene, say ``cases.A``.
+        mesh: A mesh file, or a mesh (on rank 0), in place of the case's.
+        comm: Ranks that share the work; all by default.
+        observers: Called as ``observer(problem, step)`` after each accepted step.
+        out: Folder for files and pictures; without it nothing is written.
+        **changes: See `changed`: ``run(cases.A, order=2, method="nitsche", increment=10)``.
+
+    Returns:
+        The result. If a step could not be solved it is not ``converged``, says why in ``error``, and holds the
+        steps before.
+
+    Raises:
+        InputError: Something in the input is wrong; nothing has been written.
+    """
+    start = time.perf_counter()
+    require_dolfinx()
+    from mpi4py import MPI
+
+    from extrusion import output
+    from extrusion.newton import Newton
+    from extrusion.problem import Problem
+    from extrusion.stepping import steps
+
+    comm = MPI.COMM_WORLD if comm is None else comm
+    given = str(mesh) if isinstance(mesh, str | Path) else None
+    plain = None if isinstance(mesh, str | Path) else mesh
+    case = changed(case, mesh=given, **changes)
+    problem = Problem(case, _mesh(comm, case, plain), comm)
+    newton = Newton(problem)
+    camera = output.Camera(case, PICTURED)
+    folder = None if out is None else output.Folder(out, comm)
+    watching = [camera, *(() if folder is None else folder.observers), *observers]
+    seconds = {"setup": time.perf_counter() - start, "solve": 0.0, "output": 0.0}
+
+    accepted: list[Step] = []
+    error = None
+    try:
+        with closing(_timed(steps(problem, newton, case.times()), seconds, "solve")) as stepping:
+            for step in stepping:
+                began = time.perf_counter()
+                accepted.append(dataclasses.replace(step, x=None))
+                for observer in watching:
+                    observer(problem, step)
+                seconds["output"] += time.perf_counter() - began
+    except StepError as e:
+        error = str(e)
+    for observer in watching:
+        if close := getattr(observer, "close", None):
+            close()
+    points = sum(len(state.gap) for state in accepted[-1].zones.values()) if accepted else 0
+    result = Result(
+        case=case,
+        steps=accepted,
+        dofs=problem.dofs,
+        contact_points=points,
+        ranks=comm.size,
+        converged=error is None,
+        error=error,
+        seconds=seconds,
+        snapshots=camera.snapshots(),
+    )
+    if folder is not None:
+        folder.finish(result, {"mesh": given, **changes})
+    return result
+
+
+def _mesh(comm: MPI.Intracomm, case: Case, given: PlainMesh | None) -> PlainMesh | None:
+    """The mesh on rank 0, with every group that the case asks for; None elsewhere."""
+    from extrusion.mesh import case_mesh, on_root, read_mesh
+
+    groups = ["billet", "rear", "axis", *(zone.billet for zone in case.zones)]
+    if case.die == "elastic":
+        groups += ["die", "fixed", *(zone.die for zone in case.zones)]
+
+    def make() -> PlainMesh:
+        if given is not None:
+            mesh = given
+        elif case.mesh is not None:
+            return read_mesh(case.mesh, groups)
+        else:
+            mesh = case_mesh(case.profile, case.size)
+        present = [*mesh.cells, *mesh.facets]
+        for group in groups:
+            if group not in present:
+                raise InputError("mesh", group, f"no such group; groups present: {', '.join(present)}")
+        return mesh
+
+    return on_root(comm, make)
+
+
+def _timed[T](items: Iterator[T], seconds: dict[str, float], key: str) -> Generator[T]:
+    """The items; the time they take to come is added to ``seconds[key]``."""
+    while True:
+        began = time.perf_counter()
+        try:
+            item = next(items)
+        except StopIteration:
+            return
+        finally:
+            seconds[key] += time.perf_counter() - began
+        yield item
+
+
+def verify(case: Case, **options: Any) -> list[Result]:
+    """The runs whose `Result.figures` are all that the sheet has of a case: solved, and only checked. Collective.
+
+    Args:
+        case: A case with figures.
+        **options: What `run` takes.
+
+    Raises:
+        InputError: The case has no figures, or what `run` raises.
+    """
+    if not case.figures:
+        raise InputError("figures", [], f"case {case.name} has none to verify")
+    asked = {figure.contact for figure in case.figures}
+    variants = {"solved": case, "check": case.with_contact("check")}
+    return [run(variant, **options) for contact, variant in variants.items() if contact in asked]

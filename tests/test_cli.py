@@ -1,0 +1,217 @@
+"""The command line: exit codes, one line for bad input, and what is printed where."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import extrusion
+from extrusion import cases, cli
+from extrusion.mesh import read_mesh
+from extrusion.newton import Newton
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def command(*args: str) -> int:
+    """Exit code of ``extrusion ARGS``."""
+    with pytest.raises(SystemExit) as end:
+        cli.main(args)
+    assert isinstance(end.value.code, int)
+    return end.value.code
+
+
+BROKEN = {
+    "no.toml": "name = ",
+    "short.toml": 'name = "short"\n',
+    "nu.toml": cases.to_toml(cases.A).replace("nu = 0.45", "nu = 0.5"),
+    "key.toml": "metod = 1\n" + cases.to_toml(cases.A),
+    "place.toml": cases.to_toml(cases.A).replace('name = "A"', 'name = "../place"', 1),
+    "mesh.msh": "no mesh",
+    "mesh.txt": "",
+}
+
+
+@pytest.mark.parametrize(
+    ("args", "told"),
+    [
+        ("run", "CASE|FILE.toml"),
+        ("run Z", "CASE = 'Z': unknown case: give one of A"),
+        ("run missing.toml", "case file = 'missing.toml': cannot be read"),
+        ("run no.toml", "case file = 'no.toml': is no TOML"),
+        ("run short.toml", "short.toml: increments"),
+        ("run nu.toml", "nu.toml: materials.billet.nu = 0.5"),
+        ("run key.toml", "key.toml: metod"),
+        ("run place.toml", "can name a folder"),
+        ("run A --method glue", "--method = 'glue'"),
+        ("run A --order 3", "--order = 3"),
+        ("run A --order two", "--order"),
+        ("run A --die soft", "--die = 'soft'"),
+        ("run A --contact welded", "--contact = 'welded'"),
+        ("run A --size -1", "--size = -1.0"),
+        ("run A --size 1e9", "--size = 1000000000.0"),
+        ("run A --size 2 --mesh mesh.msh", "--size = 2.0"),
+        ("run A --mesh missing.msh", "--mesh = 'missing.msh': no such file"),
+        ("run A --mesh mesh.msh", "--mesh = 'mesh.msh': cannot be read"),
+        ("run A --mesh mesh.txt", "--mesh = 'mesh.txt': give a .msh or .med file"),
+        ("run A --increment nan", "--increment = nan"),
+        ("run A --increment 0", "--increment = 0.0"),
+        ("run A --until 0", "--until = 0.0"),
+        ("run A --until 156", "--until = 156.0"),
+        ("run A --gamma -3", "--gamma = -3.0"),
+        ("run A --theta -2", "--theta = -2"),
+        ("run A --out mesh.txt", "--out = 'mesh.txt': cannot be written"),
+        ("run A --json mesh.txt/a.json", "--json = 'mesh.txt/a.json'"),
+        ("run A --bogus", "--bogus"),
+        ("verify short.toml", "short.toml: increments"),
+        ("verify A Z", "CASE = 'Z'"),
+        ("plot .", "no run.json there"),
+        ("mesh A --size 0", "--size = 0.0"),
+        ("mesh A --out a.med", "'a.med': give a name that ends in .msh"),
+        ("weld A", "weld"),
+    ],
+)
+def test_bad_input(here: Path, capsys: Capture, args: str, told: str) -> None:
+    """Exit code 2, one line that names the culprit, no traceback, nothing written."""
+    for name, text in BROKEN.items():
+        Path(name).write_text(text)
+    assert command(*args.split()) == 2
+    out, err = capsys.readouterr()
+    (line,) = err.splitlines()
+    assert line.startswith("extrusion: ")
+    assert told in line
+    assert out == ""
+    assert {path.name for path in here.iterdir()} == set(BROKEN)
+
+
+def test_run(here: Path, capsys: Capture) -> None:
+    """Files in results/CASE, a table on stdout, progress on stderr, the JSON of the issue."""
+    assert command("run", "A", "--until", "20", "--json", "sub/a.json", "--theta", "-1") == 0
+    out, err = capsys.readouterr()
+    assert "20.79" in out
+    assert "results/A" in out
+    assert "u_y(K) = 20.79" in err
+    assert {"history.csv", "contact.csv", "fields.bp", "run.json"} <= {p.name for p in (here / "results/A").iterdir()}
+    data = json.loads((here / "sub/a.json").read_text())
+    assert [step["t"] for step in data["steps"]] == [5, 10, 15, 20]
+    # a second run takes the folder again, and --quiet says nothing
+    assert command("run", "A", "--until", "5", "--quiet") == 0
+    assert capsys.readouterr() == ("", "")
+    assert len((here / "results/A/history.csv").read_text().splitlines()) == 2
+
+
+def test_json_on_stdout(capsys: Capture) -> None:
+    """Then stdout is JSON and nothing else."""
+    assert command("run", "A", "--until", "10", "--increment", "7", "--contact", "check", "--json", "-") == 0
+    data = json.loads(capsys.readouterr().out)
+    assert [step["t"] for step in data["steps"]] == [7, 10]
+    assert [step["points"]["K"] for step in data["steps"]] == [[0, 7], [0, 10]]
+
+
+def test_run_of_a_file(here: Path) -> None:
+    """A case from TOML goes to a folder of its name; options override it."""
+    case = replace(cases.A.with_increment(10, 20), name="mine", die="rigid")
+    (here / "case.toml").write_text(cases.to_toml(case))
+    assert command("run", "case.toml", "--method", "penalty", "--until", "10", "--quiet") == 0
+    data = json.loads((here / "results/mine/run.json").read_text())
+    assert (data["case"], data["die"], data["method"], len(data["steps"])) == ("mine", "rigid", "penalty", 1)
+
+
+def test_failed_step(here: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exit code 1, where and what to do on stderr; accepted steps are in the files and in the JSON."""
+    monkeypatch.setattr("extrusion.newton.Newton", partial(Newton, max_iterations=0))
+    assert command("run", "A", "--until", "20", "--json", "a.json") == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "zone 1" in last
+    assert "Try" in last
+    data = json.loads((here / "a.json").read_text())
+    assert (data["converged"], [step["t"] for step in data["steps"]]) == (False, [5])
+    assert len((here / "results/A/history.csv").read_text().splitlines()) == 2
+
+
+@pytest.mark.parametrize(("value", "code"), [(20.825, 0), (20.9, 1)])
+def test_verify(here: Path, capsys: Capture, value: float, code: int) -> None:
+    """Exit code 1 as soon as one figure is out."""
+    figures = (cases.A.figures[0], cases.Figure(t=20, value=value, tolerance=2e-3))
+    (here / "case.toml").write_text(cases.to_toml(replace(cases.A.with_increment(5, 20), figures=figures)))
+    assert command("verify", "case.toml") == code
+    out = capsys.readouterr().out
+    assert ("out" in out) is bool(code)
+    assert f"{value:.3f}" in out
+    assert [path.name for path in here.iterdir()] == ["case.toml"]
+
+
+def test_verify_of_a_figure_not_reached(here: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that stops early has not met its figures."""
+    monkeypatch.setattr("extrusion.newton.Newton", partial(Newton, max_iterations=0))
+    figures = tuple(f for f in cases.A.figures if f.t <= 20)
+    (here / "case.toml").write_text(cases.to_toml(replace(cases.A.with_increment(5, 20), figures=figures)))
+    assert command("verify", "case.toml", "--quiet") == 1
+    assert "zone 1" in capsys.readouterr().err
+
+
+def test_plot(here: Path, capsys: Capture) -> None:
+    """Pictures can be drawn again from the files."""
+    pytest.importorskip("matplotlib")
+    assert command("run", "A", "--until", "20", "--out", "here", "--quiet") == 0
+    for path in Path("here").glob("*.png"):
+        path.unlink()
+    assert command("plot", "here") == 0
+    assert capsys.readouterr().out.split() == ["here/billet.png", "here/history.png", "here/pressure.png"]
+    assert all(path.stat().st_size > 10_000 for path in Path("here").glob("*.png"))
+
+
+def test_no_pictures_without_matplotlib(
+    here: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is told, and is no error."""
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert command("run", "A", "--until", "5") == 0
+    assert "pictures skipped" in caplog.text
+    assert not list(here.rglob("*.png"))
+
+
+def test_mesh(here: Path, capsys: Capture) -> None:
+    """The mesh it writes is one that `run` takes."""
+    pytest.importorskip("gmsh", exc_type=ImportError)
+    assert command("mesh", "--size", "8", "--out", "coarse.msh") == 0
+    assert f"{len(read_mesh('coarse.msh').points)} nodes" in capsys.readouterr().out
+    assert command("run", "A", "--mesh", "coarse.msh", "--until", "5", "--quiet") == 0
+
+
+def test_list_and_version(capsys: Capture) -> None:
+    assert command("list") == 0
+    assert cases.A.title[:20] in capsys.readouterr().out
+    assert command("--version") == 0
+    assert capsys.readouterr().out.strip() == extrusion.__version__
+
+
+def test_two_ranks(here: Path) -> None:
+    """Under a launcher, K is where one rank puts it, and what is said is said once."""
+    launcher = Path(sys.executable).with_name("mpiexec")
+    if not launcher.exists() or (os.cpu_count() or 1) < 2:
+        pytest.skip("no mpiexec beside this Python, or one core")
+    start = [str(launcher), "-n", "2", sys.executable, "-m", "extrusion", "run", "A"]
+    quiet = partial(subprocess.run, capture_output=True, text=True, timeout=120)
+    bad = quiet([*start, "--out", __file__])
+    assert bad.returncode == 2, bad.stderr
+    assert len(bad.stderr.splitlines()) == 1
+    good = quiet([*start, "--until", "20", "--json", "two.json", "--quiet"])
+    assert (good.returncode, good.stdout, good.stderr) == (0, "", "")
+    assert command("run", "A", "--until", "20", "--json", "one.json", "--quiet") == 0
+    one, two = (json.loads(Path(name).read_text()) for name in ("one.json", "two.json"))
+    assert two["ranks"] == 2
+    K = [[step["points"]["K"] for step in data["steps"]] for data in (one, two)]
+    np.testing.assert_allclose(*K, rtol=0, atol=1e-8)

@@ -1,0 +1,156 @@
+"""Files of a run against its result, and pictures drawn from either."""
+
+import csv
+import json
+import tomllib
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from extrusion import cases, plots, run
+from extrusion.errors import InputError
+from extrusion.newton import Newton
+from extrusion.result import Result
+
+COMM = MPI.COMM_WORLD
+CASE = replace(cases.A.with_increment(10, 30), order=2, method="nitsche")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same on every rank."""
+    return Path(COMM.bcast(str(tmp_path_factory.mktemp("run") / "deep" / "out")))
+
+
+@pytest.fixture(scope="module")
+def result(folder: Path) -> Result:
+    result = run(CASE, out=folder)
+    COMM.barrier()
+    return result
+
+
+def table(path: Path) -> dict[str, np.ndarray]:
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+
+
+@pytest.mark.mpi
+def test_history(result: Result, folder: Path) -> None:
+    """What is in the file is what is in the result, to the last digit."""
+    history = table(folder / "history.csv")
+    for name in ("K", "L", "M"):
+        np.testing.assert_array_equal(np.stack([history[f"u_r_{name}"], history[f"u_y_{name}"]], 1), result.point(name))
+    for name in ("t", "reaction", "energy", "iterations"):
+        np.testing.assert_array_equal(history[name], getattr(result, name))
+    np.testing.assert_array_equal(history["gap_L"], result.gap("L"))
+    for name in ("die_reaction", "passes", "cuts", "residual"):
+        np.testing.assert_array_equal(history[name], [getattr(step, name) for step in result.steps])
+
+
+@pytest.mark.mpi
+def test_contact(result: Result, folder: Path) -> None:
+    """All points of all zones; the pressure's axial part holds the reaction on the rear face in balance."""
+    contact = table(folder / "contact.csv")
+    assert len(contact["t"]) == sum(len(state.s) for step in result.steps for state in step.zones.values())
+    now = (contact["t"] == 30) & (contact["zone"] == 1)
+    state = result.steps[-1].zones["1"]
+    np.testing.assert_array_equal(contact["pressure"][now], state.pressure)
+    np.testing.assert_array_equal(np.stack([contact["r"][now], contact["y"][now]], 1), state.x)
+    np.testing.assert_array_equal(contact["closed"][now], state.closed)
+    cos = contact["ray_pressure"][now] / np.where(contact["pressure"][now] == 0, 1, contact["pressure"][now])
+    slope = np.sqrt(
+        np.maximum(1 / np.where(cos == 0, 1, cos) ** 2 - 1, 0)
+    )  # B-C narrows; the elastic A-B hardly slopes
+    axial = np.sum(contact["ray_pressure"][now] * contact["weight"][now] * slope)
+    assert axial == pytest.approx(result.reaction[-1], rel=1e-3)
+
+
+@pytest.mark.mpi
+def test_fields_are_written(result: Result, folder: Path) -> None:
+    assert sum(file.stat().st_size for file in (folder / "fields.bp").iterdir()) > 10_000
+
+
+@pytest.mark.mpi
+def test_record(result: Result, folder: Path) -> None:
+    """run.json is the JSON of the result, and repeats it: the case as it was run is in it."""
+    data = json.loads((folder / "run.json").read_text())
+    assert {key: data[key] for key in result.to_dict()} == result.to_dict() | {"seconds": data["seconds"]}
+    assert data["error"] is None
+    assert cases.from_dict(tomllib.loads(data["toml"])) == CASE
+
+
+@pytest.mark.mpi
+def test_snapshots(result: Result) -> None:
+    """The steps nearest to t = 20, 70 and 155, and the last: here 20 and 30. Each vertex once, whatever the ranks."""
+    if COMM.rank != 0:
+        assert result.snapshots is None
+        return
+    shots = result.snapshots
+    assert shots is not None
+    np.testing.assert_array_equal(shots.t, [20, 30])
+    assert (len(shots.points), len(shots.triangles)) == (333, 510)
+    a, b, c = (shots.points[shots.triangles[:, i]] for i in range(3))
+    area = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    assert area[shots.billet].sum() == pytest.approx(50 * 65)
+    k = np.flatnonzero(np.linalg.norm(shots.points - CASE.profile.points["K"], axis=1) < 1e-9)
+    np.testing.assert_allclose(shots.displacement[:, k[0]], result.point("K")[1:])
+    assert shots.von_mises.shape == (2, 510)
+
+
+def test_von_mises_of_a_free_billet() -> None:
+    """Contact only checked: the billet moves rigidly, without stress."""
+    shots = run(cases.A, increment=20, until=20, contact="check").snapshots
+    assert shots is not None
+    np.testing.assert_allclose(shots.von_mises, 0, atol=1e-8)
+    billet = np.unique(shots.triangles[shots.billet])
+    np.testing.assert_allclose(shots.displacement[0, billet], np.tile([0, 20], (len(billet), 1)), atol=1e-12)
+
+
+def test_pictures(result: Result, folder: Path) -> None:
+    """Drawn from the result or from its files, a picture is the same, and shows something."""
+    pytest.importorskip("matplotlib")
+    from matplotlib.image import imread
+
+    for kind in plots.KINDS:
+        drawn = imread(folder / f"{kind}.png")
+        assert min(drawn.shape[:2]) > 400
+        assert len(np.unique(drawn.reshape(-1, drawn.shape[2]), axis=0)) > 50
+    before = [(folder / f"{kind}.png").read_bytes() for kind in plots.KINDS]
+    plots.write(plots.Record.read(folder), folder)
+    assert [(folder / f"{kind}.png").read_bytes() for kind in plots.KINDS] == before
+    with pytest.raises(InputError, match="choose one of billet, history, pressure"):
+        result.plot("billets")  # type: ignore[arg-type]
+
+
+def test_failed_run_keeps_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a single iteration the first increment goes, the billet being free; the next, on B-C, fails."""
+    monkeypatch.setattr("extrusion.newton.Newton", partial(Newton, max_iterations=0))
+    (tmp_path / "run.json").write_text("an earlier run")
+    on_disk = []
+    watch = [lambda problem, step: on_disk.append(len((tmp_path / "history.csv").read_text().splitlines()))]
+    result = run(cases.A, until=20, out=tmp_path, observers=watch)
+    assert on_disk == [2]  # header and step, while the run goes on
+    assert not result.converged
+    assert result.error is not None
+    assert "zone 1" in result.error
+    np.testing.assert_array_equal(result.t, [5])
+    np.testing.assert_array_equal(table(tmp_path / "history.csv")["t"], [5])
+    data = json.loads((tmp_path / "run.json").read_text())
+    assert (data["converged"], data["error"], len(data["steps"])) == (False, result.error, 1)
+
+
+@pytest.mark.mpi
+def test_unwritable(tmp_path: Path) -> None:
+    """A file where the folder should be: every rank is told, before anything is solved."""
+    blocked = Path(COMM.bcast(str(tmp_path / "file")))
+    if COMM.rank == 0:
+        blocked.touch()
+    COMM.barrier()
+    with pytest.raises(InputError, match="cannot be written"):
+        run(CASE, out=blocked / "out", observers=[lambda problem, step: pytest.fail("solved")])
