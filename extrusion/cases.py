@@ -25,6 +25,12 @@ METHODS: tuple[Method, ...] = get_args(Method)
 BILLET, STEEL = Elastic(5000.0, 0.45), Elastic(200000.0, 0.3)
 """The sheet's materials (section 1.2): the billet's, and the die's."""
 
+MIXED_ABOVE = 0.49
+"""Poisson's ratio of the billet above which quadratic elements take the displacement-pressure form by themselves."""
+
+LOCKING_FROM = 0.45
+"""Poisson's ratio of the billet from which linear triangles lock (the reaction is 18 % low at 2 mm): a warning."""
+
 GAMMA: Mapping[str, float] = {"nodal": 10.0, "penalty": 10.0, "nitsche": 3.0, "mortar": 3.0}
 """Default dimensionless contact stiffness (for `nodal` and `mortar` it only scales the active set's test)."""
 
@@ -93,6 +99,7 @@ class Case:
     zones: tuple[Zone, ...]
     method: Method = "nitsche"
     order: Literal[1, 2] = 2
+    form: Literal["displacement", "mixed"] | None = None  # of the billet's bulk; None: mixed above MIXED_ABOVE
     gamma: float | None = None  # [-]; None: the method's default
     theta: Literal[-1, 0, 1] = 0  # Nitsche's variant
     size: float | None = None  # mm, element size on the billet's side; None: the sheet's divisions
@@ -114,6 +121,9 @@ class Case:
         _choice("order", self.order, (1, 2))
         _choice("theta", self.theta, (-1, 0, 1))
         _choice("die", self.die, ("elastic", "rigid"))
+        _choice("form", self.form, ("displacement", "mixed", None))
+        if self.form == "mixed" and self.order == 1:
+            raise InputError("form", "mixed", "needs order 2 (Taylor-Hood: quadratic displacement, linear pressure)")
         if self.gamma is not None:
             object.__setattr__(self, "gamma", _number("gamma", self.gamma, 0.0, "give a positive number"))
         if self.size is not None:
@@ -155,6 +165,13 @@ class Case:
         return self.increments[-1][1]
 
     @property
+    def mixed(self) -> bool:
+        """Whether the billet is solved for displacement and pressure (Taylor-Hood)."""
+        if self.form is None:
+            return self.order == 2 and self.billet.nu > MIXED_ABOVE
+        return self.form == "mixed"
+
+    @property
     def contact_gamma(self) -> float:
         """The dimensionless contact stiffness in force."""
         return GAMMA[self.method] if self.gamma is None else self.gamma
@@ -193,6 +210,7 @@ def to_dict(case: Case) -> dict[str, Any]:
         "title": case.title,
         "method": case.method,
         "order": case.order,
+        "form": case.form,
         "die": case.die,
         "theta": case.theta,
         "gamma": case.gamma,

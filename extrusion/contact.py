@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 Closure = Literal["unilateral", "bilateral", "check"]
 CLOSURES: tuple[Closure, ...] = ("unilateral", "bilateral", "check")
 
+REFERENCE_NU = 0.45
+"""Poisson's ratio at which the dimensionless gamma is stated: that of the billet of SSNV504."""
+
 CLOSED_GAP = 1e-9
 """A point closer than this (relative to the billet's radius) when first paired is closed from the start."""
 
@@ -57,7 +60,7 @@ def stiffness(gamma: float, E: float, nu: float, h: Array | float) -> Array:
         nu: Its Poisson ratio.
         h: Length of the slave facet, mm.
     """
-    return np.asarray(gamma * E / h * oedometric_ratio(nu) / oedometric_ratio(0.45))
+    return np.asarray(gamma * E / h * oedometric_ratio(nu) / oedometric_ratio(REFERENCE_NU))
 
 
 def oedometric_ratio(nu: float) -> float:

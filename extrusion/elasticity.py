@@ -71,6 +71,27 @@ def virtual_work(u: Any, v: Any, lmbda: Any, mu: Any, dx: Any, axisymmetric: boo
     return ufl.inner(stress, epsilon(v, x, axisymmetric)) * measure_weight(x, axisymmetric) * dx
 
 
+def mixed_virtual_work(
+    u: Any, p: Any, v: Any, q: Any, lmbda: Any, mu: Any, dx: Any, axisymmetric: bool = False
+) -> list[list[Any]]:
+    """Blocks of the displacement-pressure form, symmetric and regular up to nu = 1/2.
+
+    The pressure is mu p, so that p has no unit and both rows are energies::
+
+        int 2 mu eps(u) : eps(v) - mu p div v = ...,    -int mu q (div u + mu / lambda p) = 0
+
+    With u quadratic and p linear and continuous this is the Taylor-Hood pair. div is the trace of the strain, the hoop
+    strain included.
+    """
+    x = ufl.SpatialCoordinate(ufl.domain.extract_unique_domain(u))
+    strain_u, strain_v = epsilon(u, x, axisymmetric), epsilon(v, x, axisymmetric)
+    weight = measure_weight(x, axisymmetric)
+    return [
+        [2 * mu * ufl.inner(strain_u, strain_v) * weight * dx, -mu * p * ufl.tr(strain_v) * weight * dx],
+        [-mu * q * ufl.tr(strain_u) * weight * dx, -(mu**2) / lmbda * p * q * weight * dx],
+    ]
+
+
 def von_mises(stress: Any) -> Any:
     """Von Mises equivalent of a 3 x 3 stress, MPa."""
     deviator = stress - ufl.tr(stress) / 3 * ufl.Identity(3)

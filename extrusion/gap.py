@@ -39,6 +39,7 @@ class Surface:
     facet_vertices: Index  # (m, 2) which of those are the facet's start and end
     side: float = 1.0  # +1 if the body lies to the left of the facets, -1 if to the right
     tabulate: Callable[[int, Array], Array] | None = None  # basix tabulate of the cell's element
+    pressure_cols: Index | None = None  # (m, 3) where z holds the cell's pressures (displacement-pressure form)
 
     @property
     def length(self) -> Array:
@@ -70,6 +71,7 @@ class Surface:
             self.facet_vertices[::-1, ::-1],
             -self.side,
             self.tabulate,
+            None if self.pressure_cols is None else self.pressure_cols[::-1],
         )
 
 
@@ -316,13 +318,14 @@ def stress_rows(
         facet: Facet of each piece, ``shape=(n,)``.
         xi: Places on it, ``shape=(n, q)``.
         direction: Unit vectors, broadcastable to ``shape=(n, q, 2)``.
-        lmbda: First Lamé parameter of the slave body, MPa.
+        lmbda: First Lamé parameter of the slave body, MPa; not used where the surface has pressures, ``mu p`` each.
         mu: Its shear modulus, MPa.
         axisymmetric: Add the hoop strain.
         variation: Return the derivative with respect to xi too (at a fixed direction).
 
     Returns:
-        Rows ``shape=(n, q, 2 K)`` in MPa/mm, and their derivative or None.
+        Rows ``shape=(n, q, 2 K)`` in MPa/mm (and 3 more, over the pressures, if the surface has them), and their
+        derivative or None.
     """
     assert slave.tabulate is not None
     reference = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
@@ -338,19 +341,24 @@ def stress_rows(
     N = slave.normal[facet][:, None]
     d = np.broadcast_to(direction, (*xi.shape, 2))
 
-    def combine(value: Array | None, gradient: Array) -> Array:
+    mixed = slave.pressure_cols is not None
+    along_N = np.einsum("nqi,nqi->nq", d, np.broadcast_to(N, d.shape))[..., None]
+    bulk = 0.0 if mixed else lmbda
+
+    def combine(value: Array | None, gradient: Array, pressure: Array) -> Array:
         divergence = gradient.copy()
         if value is not None:
             divergence[..., 0] += value
-        dn = np.einsum("nqi,nqi->nq", d, np.broadcast_to(N, d.shape))[..., None, None]
         along_d = np.einsum("nqkj,nqj->nqk", gradient, d)[..., None]
         along_n = np.einsum("nqkj,nqj->nqk", gradient, np.broadcast_to(N, d.shape))[..., None]
-        S = lmbda * dn * divergence + mu * (along_d * N[:, :, None] + along_n * d[:, :, None])
-        return np.asarray(S.reshape(*xi.shape, -1))
+        S = bulk * along_N[..., None] * divergence + mu * (along_d * N[:, :, None] + along_n * d[:, :, None])
+        S = S.reshape(*xi.shape, -1)
+        return np.concatenate([S, -mu * along_N * pressure], axis=2) if mixed else np.asarray(S)
 
     start, t = slave.X[facet, 0], slave.X[facet, 1] - slave.X[facet, 0]
     r = (start[:, :1] + xi * t[:, :1])[..., None]
-    rows = combine(phi / r if axisymmetric else None, grad)
+    barycentric = np.stack([1 - at[..., 0] - at[..., 1], at[..., 0], at[..., 1]], axis=-1)
+    rows = combine(phi / r if axisymmetric else None, grad, barycentric)
     if not variation:
         return rows, None
     # second derivatives along the facet: table[3:6] are xx, xy, yy in reference coordinates
@@ -363,7 +371,8 @@ def stress_rows(
     grad_xi = np.einsum("inqk,nij->nqkj", along, K)
     phi_xi = np.einsum("inqk,ni->nqk", table[1:3], tangent)
     hoop_xi = phi_xi / r - phi * t[:, None, :1] / r**2 if axisymmetric else None
-    return rows, combine(hoop_xi, grad_xi)
+    barycentric_xi = np.stack([-tangent.sum(axis=1), tangent[:, 0], tangent[:, 1]], axis=-1)
+    return rows, combine(hoop_xi, grad_xi, np.broadcast_to(barycentric_xi[:, None], barycentric.shape))
 
 
 KEPT = 0.02

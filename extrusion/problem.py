@@ -1,8 +1,9 @@
 """Two bodies, their supports and their contact zones: residual, tangent and reports of one scene.
 
-The unknown x holds the displacement of both bodies in one Lagrange space (one mesh, two unconnected parts) and, at
-its end, on the last rank, the multipliers. The bulk stiffness K is constant; contact adds a few sparse rows that every
-rank computes whole from the gathered surfaces, and of which it keeps those it owns.
+The unknown x holds, on each rank, the displacement of both bodies in one Lagrange space (one mesh, two unconnected
+parts), the billet's pressure if the form is mixed, and, on the last rank, at its end, the multipliers. The bulk
+stiffness K is constant; contact adds a few sparse rows that every rank computes whole from the gathered surfaces, and
+of which it keeps those it owns.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ import ufl
 from dolfinx import fem
 
 from extrusion.cases import Case, Zone
-from extrusion.contact import stiffness
-from extrusion.elasticity import epsilon, quadrature_degree, sigma, virtual_work, von_mises
+from extrusion.contact import REFERENCE_NU, stiffness
+from extrusion.elasticity import epsilon, mixed_virtual_work, quadrature_degree, sigma, virtual_work, von_mises
 from extrusion.errors import InputError
 from extrusion.gap import Array, Index, Surface, polyline
 from extrusion.mesh import PlainMesh, TaggedMesh, check_profile, distribute, on_root
@@ -47,6 +48,7 @@ class Problem:
         self.tagged: TaggedMesh = distribute(comm, mesh, bodies)
         self.bodies = bodies
         self.V = fem.functionspace(self.tagged.msh, ("Lagrange", case.order, (2,)))
+        self.Q = fem.functionspace(self.tagged.msh, ("Lagrange", 1)) if case.mixed else None
         self._materials = {"billet": case.billet, "die": case.die_material}
         self._assemble_bulk()
         self._find_supports()
@@ -60,12 +62,23 @@ class Problem:
         degree = quadrature_degree(self.case.order, axisymmetric=True)
         dx = ufl.Measure("dx", msh, subdomain_data=self.tagged.cell_tags, metadata={"quadrature_degree": degree})
         u, v = ufl.TrialFunction(self.V), ufl.TestFunction(self.V)
-        form = 0
+        form: ufl.Form = 0
+        blocks: list[list[ufl.Form]] = []
         for body in self.bodies:
             material = self._materials[body]
             lmbda, mu = (fem.Constant(msh, float(value)) for value in (material.lmbda, material.mu))
-            form += virtual_work(u, v, lmbda, mu, dx(groups[body]), axisymmetric=True)
-        self.K = dolfinx.fem.petsc.assemble_matrix(fem.form(form))
+            measure = dx(groups[body])
+            if body == "billet" and self.Q is not None:
+                p, q = ufl.TrialFunction(self.Q), ufl.TestFunction(self.Q)
+                blocks = mixed_virtual_work(u, p, v, q, lmbda, mu, measure, axisymmetric=True)
+                form += blocks[0][0]
+            else:
+                form += virtual_work(u, v, lmbda, mu, measure, axisymmetric=True)
+        if blocks:
+            blocks[0][0] = form
+            self.K = dolfinx.fem.petsc.assemble_matrix(fem.form(blocks), kind="mpi")
+        else:
+            self.K = dolfinx.fem.petsc.assemble_matrix(fem.form(form))
         self.K.assemble()
 
     def stress_fields(self, x: PETSc.Vec) -> dict[str, fem.Function]:
@@ -114,7 +127,15 @@ class Problem:
 
         self._driven = own(rear, 1)
         self._clamped = np.concatenate([own(clamped, 0), own(clamped, 1)])
-        self._held = np.unique(np.concatenate([self._driven, self._clamped, own(axis, 0), own(on_die_axis, 0)]))
+        held = [self._driven, self._clamped, own(axis, 0), own(on_die_axis, 0)]
+        self._n_pressures = 0
+        if self.Q is not None:  # the die has none
+            self._n_pressures = self.Q.dofmap.index_map.size_local
+            billet = np.unique(self.Q.dofmap.list[self.tagged.cell_tags.find(self.tagged.groups["billet"])])
+            held.append(self._owned + np.setdiff1d(np.arange(self._n_pressures), billet))
+        self._held = np.unique(np.concatenate(held))
+        self._first_dof = 2 * index_map.local_range[0]
+        self._first_pressure = self.Q.dofmap.index_map.local_range[0] if self.Q is not None else 0
         self._billet_y = own(self._blocks_of("billet"), 1)
         if self.comm.allreduce(len(self._driven)) == 0:
             raise InputError("mesh", "rear", "the group of the pushed face has no facets")
@@ -132,7 +153,7 @@ class Problem:
             for group in (zone.billet, *((zone.die,) if case.die == "elastic" else ())):
                 facets = self.tagged.facet_tags.find(self.tagged.groups[group])
                 try:
-                    traces[group] = gather_trace(self.V, facets, 1 - AXIS[zone.ray])
+                    traces[group] = gather_trace(self.V, facets, 1 - AXIS[zone.ray], self.Q)
                 except ValueError as error:
                     raise InputError("mesh", group, str(error)) from None
         needs_cells = {zone.billet if zone.slave == "billet" else zone.die for zone in case.zones}
@@ -141,7 +162,7 @@ class Problem:
         live = [trace.cell_nodes if g in needs_cells else trace.nodes for g, trace in traces.items()]
         self._live = np.unique(np.concatenate([nodes.ravel() for nodes in live]))
         n = len(self._live)
-        surfaces = {g: trace.surface(self._live, g in needs_cells) for g, trace in traces.items()}
+        surfaces: dict[str, Surface] = {}
         if case.die == "rigid":
             for zone in case.zones:
                 names = profile.bore if zone.die == "bore" else profile.cone
@@ -155,13 +176,21 @@ class Problem:
                 surfaces[zone.die] = polyline(curve, n, side)
                 n += len(curve)
         self._n_nodes = n
+        with_pressure = [g for g in needs_cells if self.Q is not None and g in ("side", "front")]
+        pressed = [traces[g].pressures.ravel() for g in with_pressure]
+        self._live_pressures = np.unique(np.concatenate([*pressed, np.zeros(0, dtype=np.int64)]))
+        for group, trace in traces.items():
+            cols = None
+            if group in with_pressure:
+                cols = 2 * n + np.searchsorted(self._live_pressures, trace.pressures)
+            surfaces[group] = trace.surface(self._live, group in needs_cells, cols)
         self.terms: list[ContactTerm] = []
-        first = 2 * n
+        self._first_multiplier = first = 2 * n + len(self._live_pressures)
         for zone in case.zones:
             term = self._term(zone, surfaces, first)
             first += term.multipliers
             self.terms.append(term)
-        self.n_multipliers = first - 2 * n
+        self.n_multipliers = first - self._first_multiplier
 
     def _term(self, zone: Zone, surfaces: dict[str, Surface], first: int) -> ContactTerm:
         case = self.case
@@ -173,7 +202,9 @@ class Problem:
         # past its ends the die goes on straight; but what a glissière without a second zone pushes past F is let go
         extended = zone.contact != "bilateral" or len(case.zones) > 1
         pair = Pair(zone.name, slave, master, AXIS[zone.ray], sign, zone.contact, ray, zone.smooth, extended)
-        k = stiffness(case.contact_gamma, material.E, material.nu, slave.length)
+        # the displacement form's stress, which Nitsche's term bounds, stiffens towards nu = 1/2; a pressure does not
+        nu = material.nu if case.method in ("nitsche", "penalty") and not case.mixed else REFERENCE_NU
+        k = stiffness(case.contact_gamma, material.E, nu, slave.length)
         rest: tuple[float, bool] = (case.profile.radius, zone.initial == "interpenetrating")
         if case.method == "nodal":
             return NodalContact(pair, first, k, *rest)
@@ -185,19 +216,25 @@ class Problem:
 
     def _lay_out(self) -> None:
         comm, last = self.comm, self.comm.rank == self.comm.size - 1
-        index_map = self.V.dofmap.index_map
-        self.n_displacements = 2 * index_map.size_global
-        self.n = self.n_displacements + self.n_multipliers
-        self.n_local = self._owned + (self.n_multipliers if last else 0)
-        self.x = PETSc.Vec().createMPI((self.n_local, self.n), comm=comm)
+        self.n_local = self._owned + self._n_pressures + (self.n_multipliers if last else 0)
+        self.x = PETSc.Vec().createMPI((self.n_local, PETSc.DETERMINE), comm=comm)
+        self.n = self.x.size
         self._row0 = self.x.owner_range[0]
-        self.n_z = 2 * self._n_nodes + self.n_multipliers
-        live = (2 * self._live[:, None] + np.arange(2)).ravel()
-        multipliers = self.n_displacements + np.arange(self.n_multipliers)
+        # where each rank's displacements and pressures begin, in their own spaces and in x
+        starts = np.array(comm.allgather((self._first_dof, self._first_pressure, self._row0, self._owned)))
+
+        def in_x(dofs: Index, space: int) -> Index:
+            rank = np.searchsorted(starts[:, space], dofs, side="right") - 1
+            return np.asarray(dofs - starts[rank, space] + starts[rank, 2] + (starts[rank, 3] if space else 0))
+
+        live = in_x((2 * self._live[:, None] + np.arange(2)).ravel(), 0)
+        pressures = in_x(self._live_pressures, 1)
+        multipliers = self.n - self.n_multipliers + np.arange(self.n_multipliers)
+        self.n_z = self._first_multiplier + self.n_multipliers
         self._z_to_x = np.full(self.n_z, -1, dtype=np.int64)
         self._z_to_x[: len(live)] = live
-        self._z_to_x[2 * self._n_nodes :] = multipliers
-        taken = np.concatenate([live, multipliers]).astype(PETSc.IntType)
+        self._z_to_x[2 * self._n_nodes :] = np.concatenate([pressures, multipliers])
+        taken = self._z_to_x[self._z_to_x >= 0].astype(PETSc.IntType)
         self._z_live = np.flatnonzero(self._z_to_x >= 0)
         source = PETSc.IS().createGeneral(taken, comm=PETSc.COMM_SELF)
         self._z_vec = PETSc.Vec().createSeq(len(taken))
@@ -279,7 +316,10 @@ class Problem:
         return self._tangent.fill(none, none, np.zeros(0))
 
     def round_off(self, x: PETSc.Vec) -> float:
-        """Norm of the round-off in the residual at x, N: machine epsilon times the forces |K| |u| that cancel in it."""
+        """Norm of the round-off in the residual at x, N.
+
+        Machine epsilon times the forces |K| |u| that cancel in it, and the contact stiffness times that of a position.
+        """
         u, f = x.duplicate(), x.duplicate()
         u.array[:] = np.abs(x.array_r)
         u.array[self._owned :] = 0.0
@@ -287,7 +327,9 @@ class Problem:
         norm = float(f.norm())
         u.destroy()
         f.destroy()
-        return float(np.finfo(float).eps) * norm
+        farthest = float(np.max(np.abs(list(self.case.profile.points.values()))))
+        in_gaps = sum(farthest * term.stiffness_norm() for term in self.terms)
+        return float(np.finfo(float).eps) * (norm + in_gaps)
 
     # -- reports ---------------------------------------------------------------------------------------------
 
@@ -387,7 +429,7 @@ class Problem:
         if rank == self.comm.rank:
             block = at // 2
             place = self.V.tabulate_dof_coordinates()[block, :2] + x.array_r[2 * block : 2 * block + 2]
-            node = np.searchsorted(self._live, block + self._row0 // 2)
+            node = np.searchsorted(self._live, block + self._first_dof // 2)
             zones = [t.pair.name for t in self.terms if node in t.pair.slave.nodes or node in t.pair.die.nodes]
             where = f"zone {' and '.join(zones)}" if zones else "away from the zones"
             text = f"{where}, (r, y) = ({place[0]:.3f}, {place[1]:.3f}) mm, out of balance by {largest:.3g} N"
@@ -424,11 +466,13 @@ class TangentMatrix:
         is_held[held] = True
         off = is_held[rows + row0] | is_held[indices]
         data = np.where(off, 0.0, data)
-        diagonal = is_held[rows + row0] & (indices == rows + row0)
-        data[diagonal] = float(np.max(np.abs(data), initial=1.0))
         keys = rows * np.int64(n) + indices
         own = np.arange(n_local, dtype=np.int64)
         own = own * np.int64(n) + own + row0  # every diagonal entry, the multipliers' too
+        self._held_keys, self._held_value = (
+            own[is_held[row0 : row0 + n_local]],
+            float(np.max(np.abs(data), initial=1.0)),
+        )
         self._bulk_keys, self._bulk = keys, data
         self._set_pattern(_sorted_distinct(np.concatenate([keys, own])))
 
@@ -436,6 +480,7 @@ class TangentMatrix:
         self._keys = keys
         self._base = np.zeros(len(keys))
         self._base[np.searchsorted(keys, self._bulk_keys)] = self._bulk
+        self._base[np.searchsorted(keys, self._held_keys)] = self._held_value
 
     def _create(self) -> PETSc.Mat:
         rows, cols = self._keys // self._n + self._row0, self._keys % self._n

@@ -24,9 +24,16 @@ class Trace:
     facet_vertices: Index  # (m, 2)
     side: float
     tabulate: Any
+    pressures: Index  # (m, 3) global pressure dofs of the cells; (m, 0) without a pressure space
 
-    def surface(self, numbers: Index, with_cells: bool) -> Surface:
-        """The same facets numbered by place in ``numbers`` (sorted global dofs)."""
+    def surface(self, numbers: Index, with_cells: bool, pressure_cols: Index | None = None) -> Surface:
+        """The same facets numbered by place in ``numbers`` (sorted global dofs).
+
+        Args:
+            numbers: Sorted global blocked dofs that z holds.
+            with_cells: Take the cells behind the facets too.
+            pressure_cols: Where z holds the cells' pressures, if it does.
+        """
         cell_nodes, local = self.cell_nodes, self.local
         if not with_cells:
             cell_nodes, local = self.nodes, np.broadcast_to(np.arange(self.nodes.shape[1]), self.nodes.shape)
@@ -39,16 +46,18 @@ class Trace:
             self.facet_vertices,
             self.side,
             self.tabulate,
+            pressure_cols,
         )
 
 
-def gather_trace(V: Any, facets: Index, base: int) -> Trace:
+def gather_trace(V: Any, facets: Index, base: int, Q: Any = None) -> Trace:
     """The facets of one boundary curve on every rank, in order of growing coordinate ``base``.
 
     Args:
         V: Vector Lagrange space of order 1 or 2 on straight triangles.
         facets: This rank's exterior facets of the curve (ghosts allowed).
         base: Coordinate along which the curve is ordered, 0 or 1.
+        Q: Linear pressure space on the same mesh, if any.
 
     Raises:
         ValueError: The facets are no single open curve.
@@ -76,29 +85,19 @@ def gather_trace(V: Any, facets: Index, base: int) -> Trace:
             start, end = end, start
             local[:2] = local[1::-1]
         nodes = dofs[local]
-        rows.append(
-            (
-                node_x[nodes][:, :2],
-                _global(dofmap, nodes),
-                _global(dofmap, dofs),
-                local,
-                vertices,
-                (start, end),
-            )
-        )
+        pressures = _global(Q.dofmap, Q.dofmap.cell_dofs(cell)) if Q is not None else np.zeros(0, dtype=np.int64)
+        at = _global(dofmap, nodes), _global(dofmap, dofs)
+        rows.append((node_x[nodes][:, :2], *at, local, vertices, (start, end), pressures))
     gathered = [row for part in msh.comm.allgather(rows) for row in part]
     columns = [np.array(column) for column in zip(*gathered, strict=True)]
     order = _chain(columns[1][:, :2])
-    X, nodes, cell_nodes, local, cell_X, ends = (column[order] for column in columns)
-    element = V.element.basix_element
-    trace = Trace(X, nodes, cell_nodes, local, cell_X, ends, 1.0, _tabulator(element))
+    side = 1.0
+    X, nodes, cell_nodes, local, cell_X, ends, pressures = (column[order] for column in columns)
     if X[-1, 1, base] < X[0, 0, base]:
-        swap = [1, 0, *range(2, nodes.shape[1])]
-        trace = Trace(
-            X[::-1, swap], nodes[::-1, swap], cell_nodes[::-1], local[::-1, swap], cell_X[::-1], ends[::-1, ::-1],
-            -1.0, trace.tabulate,
-        )  # fmt: skip
-    return trace
+        swap, side = [1, 0, *range(2, nodes.shape[1])], -1.0
+        X, nodes, local, ends = X[::-1, swap], nodes[::-1, swap], local[::-1, swap], ends[::-1, ::-1]
+        cell_nodes, cell_X, pressures = cell_nodes[::-1], cell_X[::-1], pressures[::-1]
+    return Trace(X, nodes, cell_nodes, local, cell_X, ends, side, _tabulator(V.element.basix_element), pressures)
 
 
 def _tabulator(element: Any) -> Any:

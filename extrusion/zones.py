@@ -91,6 +91,9 @@ class ContactTerm(Protocol):
     def state(self, z: Array) -> ContactState:
         """Report at z."""
 
+    def stiffness_norm(self) -> float:
+        """Norm of force over gap, N/mm: how much round-off in a position weighs in the residual."""
+
 
 def closed_at_start(gap: Array, radius: float, interpenetrating: bool) -> np.ndarray:
     """Points that a bilateral zone holds from t = 0: gap zero, or also negative where the start may interpenetrate."""
@@ -139,6 +142,9 @@ class NodalContact:
             self._facet = found.facet
             self._past, self._cos = found.past, np.abs(found.normal @ pair.direction)
         self._g0 = g - self._apply(z)
+
+    def stiffness_norm(self) -> float:
+        return float(np.linalg.norm(self._kappa)) if self.multipliers else 0.0
 
     def _apply(self, z: Array) -> Array:
         return np.einsum("nl,nl->n", self._G, z[self._cols])
@@ -228,6 +234,10 @@ class IntegratedContact:
     def pair_up(self, z: Array, settle: bool = False) -> None:
         pass
 
+    def stiffness_norm(self) -> float:
+        weight = facet_weights(self.pair.slave, self.pair.axisymmetric)
+        return 0.0 if self.pair.closure == "check" else float(np.linalg.norm(self._k * weight))
+
     def _whole_facets(self, points: Points, held: np.ndarray) -> np.ndarray:
         every = np.ones(len(self.closed), dtype=bool)
         np.logical_and.at(every, points.facet, held.all(axis=1))
@@ -256,8 +266,16 @@ class IntegratedContact:
             pair.slave, points.facet, points.xi, direction, self._material.lmbda, self._material.mu,
             pair.axisymmetric, variation and pair.ray,
         )  # fmt: skip
-        pad = ((0, 0), (0, 0), (0, points.G.shape[2] - S.shape[2]))
-        return points, np.pad(S, pad), None if S_xi is None else np.pad(S_xi, pad)
+        # S stands over the cell's displacements, then (mixed form) its pressures; the points over cell and die
+        n_u, n_points = 2 * pair.slave.cell_nodes.shape[1], points.G.shape[2]
+
+        def over_all(rows: Array) -> Array:
+            between = np.zeros((*rows.shape[:2], n_points - n_u))
+            return np.concatenate([rows[..., :n_u], between, rows[..., n_u:]], axis=2)
+
+        if pair.slave.pressure_cols is not None:
+            points = _widened(points, pair.slave.pressure_cols[points.facet])
+        return points, over_all(S), None if S_xi is None else over_all(S_xi)
 
     def _law(self, z: Array, points: Points, S: Array | None) -> tuple[Array, Array, Array, Array]:
         k = self._k[points.facet][:, None]
@@ -377,6 +395,10 @@ class MortarContact:
         return ray_points(
             pair.slave, pair.die, _even(z), pair.axis, pair.sign, self._order, pair.axisymmetric, variation
         )
+
+    def stiffness_norm(self) -> float:
+        weight = facet_weights(self.pair.slave, self.pair.axisymmetric)
+        return self._k * float(np.linalg.norm(weight)) if self.multipliers else 0.0
 
     def _rows(self, points: Points) -> tuple[Array, Array, Array]:
         """Weak gap (mm^3), facing weight (mm^2) of each row, and the point weights that count."""
@@ -508,6 +530,12 @@ def nodal_weights(surface: Surface, axisymmetric: bool) -> Array:
     return np.asarray(out[nodes])
 
 
+def facet_weights(surface: Surface, axisymmetric: bool) -> Array:
+    """Area of each reference facet (2 pi r ds), mm^2, or its length, mm."""
+    radius = surface.X[:, :2, 0].mean(axis=1)
+    return np.asarray(surface.length * (2 * np.pi * radius if axisymmetric else 1.0))
+
+
 def gap_at_nodes(pair: Pair, z: Array) -> tuple[Index, Array]:
     """Slave nodes in order and the zone's gap there, mm."""
     nodes = pair.slave.node_numbers
@@ -533,6 +561,18 @@ def _none() -> Triplets:
 def _take(points: Points, on: np.ndarray) -> Points:
     values = {name: value[on] if isinstance(value, np.ndarray) else value for name, value in vars(points).items()}
     values["curvature"] = tuple((a[on], b[on]) for a, b in points.curvature)
+    return Points(**values)
+
+
+def _widened(points: Points, cols: Index) -> Points:
+    """The points with further local columns, on which gap and weights do not depend."""
+
+    def wide(rows: Array | None) -> Array | None:
+        return None if rows is None else np.pad(rows, ((0, 0), (0, 0), (0, cols.shape[1])))
+
+    values = vars(points) | {name: wide(getattr(points, name)) for name in ("G", "G_xi", "dxi", "dweight")}
+    values["cols"] = np.concatenate([points.cols, cols], axis=1)
+    values["curvature"] = tuple((wide(a), wide(b)) for a, b in points.curvature)
     return Points(**values)
 
 
