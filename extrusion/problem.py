@@ -29,6 +29,9 @@ from extrusion.mesh import PlainMesh, TaggedMesh, check_profile, distribute, on_
 from extrusion.surfaces import Trace, all_ranks, gather_trace
 from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact, Pair, gap_at_nodes
 
+SAFETY = 32.0
+"""How far below the symmetric method's coercive gamma the unsymmetric one (theta = 0) may go."""
+
 AXIS = {"r": 0, "y": 1}
 
 
@@ -54,6 +57,8 @@ class Problem:
         self._find_supports()
         self._gather_contact()
         self._lay_out()
+        if case.method == "nitsche" and case.theta != -1:
+            self._refuse_indefinite()
 
     # -- bulk ------------------------------------------------------------------------------------------------
 
@@ -128,11 +133,12 @@ class Problem:
         self._driven = own(rear, 1)
         self._clamped = np.concatenate([own(clamped, 0), own(clamped, 1)])
         held = [self._driven, self._clamped, own(axis, 0), own(on_die_axis, 0)]
-        self._n_pressures = 0
+        self._n_pressures = self._free_pressures = 0
         if self.Q is not None:  # the die has none
             self._n_pressures = self.Q.dofmap.index_map.size_local
             billet = np.unique(self.Q.dofmap.list[self.tagged.cell_tags.find(self.tagged.groups["billet"])])
             held.append(self._owned + np.setdiff1d(np.arange(self._n_pressures), billet))
+            self._free_pressures = self._n_pressures - len(held[-1])
         self._held = np.unique(np.concatenate(held))
         self._first_dof = 2 * index_map.local_range[0]
         self._first_pressure = self.Q.dofmap.index_map.local_range[0] if self.Q is not None else 0
@@ -330,6 +336,57 @@ class Problem:
         farthest = float(np.max(np.abs(list(self.case.profile.points.values()))))
         in_gaps = sum(farthest * term.stiffness_norm() for term in self.terms)
         return float(np.finfo(float).eps) * (norm + in_gaps)
+
+    def _refuse_indefinite(self) -> None:
+        """Refuse a gamma too small for the mesh, where contact can be lost in silence.
+
+        With all contact facets closed, the symmetric method is coercive from a gamma_c on that depends on the mesh and
+        the element (26 for P2 here, 8 for P1): theta = 1 needs as much. theta = 0 is coercive from gamma_c / 4 and
+        was found regular to below gamma_c / 90; it is refused below gamma_c / `SAFETY`. theta = -1 always is.
+
+        Raises:
+            InputError: The smallest gamma is in the message.
+        """
+        case = self.case
+        factor = 1.0 if case.theta == 1 else SAFETY
+        if self._indefinite(factor):
+            low, high = factor, 2 * factor
+            while self._indefinite(high):
+                low, high = high, 2 * high
+            while high / low > 1.02:
+                middle = float(np.sqrt(low * high))
+                low, high = (middle, high) if self._indefinite(middle) else (low, middle)
+            least = high / factor * case.contact_gamma
+            remedy = (
+                f"theta = {case.theta} is not safe on this mesh below gamma = {least:.3g}: give more, or theta = -1"
+            )
+            raise InputError("gamma", case.contact_gamma, remedy)
+
+    def _indefinite(self, factor: float) -> bool:
+        """Whether the closed-edge problem with ``factor`` times the contact stiffness has a negative direction."""
+        rows, cols, values = [], [], []
+        for term in self.terms:
+            if isinstance(term, IntegratedContact) and term.pair.closure != "check":
+                (i, j, fixed), with_k = term.closed_edge()
+                keep = self._z_row[i] & self._z_free[j]
+                rows.append(self._z_to_x[i[keep]] - self._row0)
+                cols.append(self._z_to_x[j[keep]])
+                values.append((fixed + factor * with_k)[keep])
+        if not rows:
+            return False
+        A = self._tangent.fill(*(np.concatenate(part) for part in (rows, cols, values)))
+        pc = PETSc.PC().create(self.comm)
+        pc.setType("cholesky")
+        pc.setFactorSolverType("mumps")
+        pc.setOperators(A)
+        pc.setFactorSetUpSolverType()
+        factor_matrix = pc.getFactorMatrix()
+        factor_matrix.setMumpsIcntl(24, 1)  # inertia is only known with null pivots looked for
+        factor_matrix.setMumpsIcntl(13, 1)  # and with the last front factored on one rank
+        pc.setUp()
+        negative = factor_matrix.getInertia()[0]
+        pc.destroy()
+        return bool(negative > self.comm.allreduce(self._free_pressures))
 
     # -- reports ---------------------------------------------------------------------------------------------
 

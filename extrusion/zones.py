@@ -336,6 +336,35 @@ class IntegratedContact:
         cols = np.broadcast_to(points.cols[:, None, :], J.shape)
         return rows.ravel(), cols.ravel(), J.ravel()
 
+    def closed_edge(self) -> tuple[Triplets, Array]:
+        """What the symmetric method (theta = 1) adds to the bulk with every facet closed against a plane die.
+
+        Returns:
+            Triplets of ``G^T w S + S^T w G``, and the values of ``G^T w k G`` at the same places.
+        """
+        slave, K = self.pair.slave, self.pair.slave.cell_nodes.shape[1]
+        xi, omega = np.polynomial.legendre.leggauss(self._order)
+        facet = np.arange(len(slave.nodes))
+        at = np.broadcast_to((xi + 1) / 2, (len(facet), self._order))
+        assert self._material is not None
+        normal = slave.normal[:, None]
+        S, _ = stress_rows(slave, facet, at, normal, self._material.lmbda, self._material.mu, self.pair.axisymmetric)
+        G = np.zeros_like(S)
+        N = shape(at, slave.nodes.shape[1])
+        for component in (0, 1):
+            where = np.broadcast_to(2 * slave.local[:, None] + component, N.shape)
+            np.put_along_axis(G, where, -normal[..., component, None] * N, axis=2)
+        radius = slave.X[:, :1, 0] + at * (slave.X[:, 1:2, 0] - slave.X[:, :1, 0])
+        w = slave.length[:, None] * omega / 2 * (2 * np.pi * radius if self.pair.axisymmetric else 1.0)
+        cols = (2 * slave.cell_nodes[..., None] + np.arange(2)).reshape(-1, 2 * K)
+        if slave.pressure_cols is not None:
+            cols = np.concatenate([cols, slave.pressure_cols], axis=1)
+        GS = np.einsum("nq,nqi,nqj->nij", w, G, S)
+        GG = np.einsum("nq,nqi,nqj->nij", w * self._k[:, None], G, G)
+        rows = np.broadcast_to(cols[:, :, None], GS.shape).ravel()
+        across = np.broadcast_to(cols[:, None, :], GS.shape).ravel()
+        return (rows, across, (GS + np.swapaxes(GS, 1, 2)).ravel()), GG.ravel()
+
     def accept(self, z: Array) -> None:
         if self.pair.closure == "bilateral":
             points, S, _ = self._points(z, False)
