@@ -76,13 +76,15 @@ class Zone:
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A figure that the sheet tests: axial displacement of a point, or a gap when contact is only checked."""
+    """A figure that the sheet tests: axial displacement of a point, a gap when contact is only checked, or how many
+    nodes of the billet's side, counted from M, are open while all others are closed (-1: no such state).
+    """
 
     t: float  # mm
-    value: float  # mm
+    value: float  # mm, or a number of nodes
     tolerance: float  # relative
     point: str = "K"
-    quantity: Literal["u_y", "gap"] = "u_y"
+    quantity: Literal["u_y", "gap", "open"] = "u_y"
     contact: Literal["solved", "check"] = "solved"  # check: the run with contact checked, not enforced
 
 
@@ -102,7 +104,7 @@ class Case:
     form: Literal["displacement", "mixed"] | None = None  # of the billet's bulk; None: mixed above MIXED_ABOVE
     gamma: float | None = None  # [-]; None: the method's default
     theta: Literal[-1, 0, 1] = 0  # Nitsche's variant
-    size: float | None = None  # mm, element size on the billet's side; None: the sheet's divisions
+    size: float | None = None  # mm, on the billet's side; None: the profile's divisions, else radius / 25
     mesh: str | None = None  # mesh file, in place of a mesh of the profile
     increments: tuple[tuple[float, float], ...]  # (increment, up to t), mm
     figures: tuple[Figure, ...] = field(default=(), repr=False)
@@ -170,6 +172,13 @@ class Case:
         if self.form is None:
             return self.order == 2 and self.billet.nu > MIXED_ABOVE
         return self.form == "mixed"
+
+    @property
+    def mesh_size(self) -> float | None:
+        """Element size in force, mm; None where the profile's divisions count."""
+        if self.size is None and not self.profile.divisions:
+            return self.profile.radius / 25
+        return self.size
 
     @property
     def contact_gamma(self) -> float:
@@ -400,7 +409,8 @@ D = Case(
     method="nodal",
     order=1,
     increments=((5.0, 155.0),),
-    figures=K,
+    # contact states at K opposite E: the two side nodes nearest M open, the other nine closed
+    figures=(*K, Figure(t=70, value=2, tolerance=0.0, point="M", quantity="open")),
 )
 
 E = Case(

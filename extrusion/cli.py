@@ -88,6 +88,10 @@ def run(
         float | None, typer.Option(metavar="MM", help="Uniform increment, in place of the case's table.")
     ] = None,
     until: Annotated[float | None, typer.Option(metavar="MM", help="Last t; by default the case's.")] = None,
+    form: Annotated[
+        str | None,
+        typer.Option(metavar="displacement|mixed", help="The billet's bulk; by default mixed above nu 0.49."),
+    ] = None,
     gamma: Annotated[float | None, typer.Option(help="Dimensionless contact stiffness.")] = None,
     theta: Annotated[int | None, typer.Option(metavar="-1|0|1", help="Variant of Nitsche's method.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for files; by default results/CASE.")] = None,
@@ -99,7 +103,7 @@ def run(
     """Run a case; write tables, fields and pictures."""
     changes = dict(
         method=method, order=order, die=die, contact=contact, size=size, mesh=mesh, increment=increment,
-        until=until, gamma=gamma, theta=theta,
+        until=until, form=form, gamma=gamma, theta=theta,
     )  # fmt: skip
     given = {name for name, value in changes.items() if value is not None}
     logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, format="extrusion: %(message)s")

@@ -8,6 +8,7 @@ of which it keeps those it owns.
 
 from __future__ import annotations
 
+import logging
 from functools import cached_property
 from itertools import pairwise
 
@@ -20,7 +21,7 @@ import dolfinx.fem.petsc
 import ufl
 from dolfinx import fem
 
-from extrusion.cases import Case, Zone
+from extrusion.cases import LOCKING_FROM, Case, Zone
 from extrusion.contact import REFERENCE_NU, stiffness
 from extrusion.elasticity import epsilon, mixed_virtual_work, quadrature_degree, sigma, virtual_work, von_mises
 from extrusion.errors import InputError
@@ -28,6 +29,8 @@ from extrusion.gap import Array, Index, Surface, polyline
 from extrusion.mesh import PlainMesh, TaggedMesh, check_profile, distribute, on_root
 from extrusion.surfaces import Trace, all_ranks, gather_trace
 from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact, Pair, gap_at_nodes
+
+log = logging.getLogger(__name__)
 
 SAFETY = 32.0
 """How far below the symmetric method's coercive gamma the unsymmetric one (theta = 0) may go."""
@@ -46,6 +49,8 @@ class Problem:
 
     def __init__(self, case: Case, mesh: PlainMesh | None, comm: MPI.Intracomm = MPI.COMM_WORLD) -> None:
         self.case, self.comm = case, comm
+        if case.order == 1 and case.billet.nu >= LOCKING_FROM and case.method != "nodal" and comm.rank == 0:
+            log.warning("order = 1 at nu = %g: linear triangles lock, the reaction is far too low", case.billet.nu)
         on_root(comm, lambda: check_profile(mesh, case.profile) if mesh else None)
         bodies = ("billet", "die") if case.die == "elastic" else ("billet",)
         self.tagged: TaggedMesh = distribute(comm, mesh, bodies)

@@ -123,8 +123,7 @@ class Result:
             computed = math.nan
             for step in self.steps:
                 if math.isclose(step.t, figure.t, rel_tol=1e-9):
-                    known = step.gap.get(figure.point) if figure.quantity == "gap" else step.points[figure.point][1]
-                    computed = math.nan if known is None else known
+                    computed = _figure(figure, step)
             rows.append(Comparison(figure, computed))
         return rows
 
@@ -332,6 +331,17 @@ def run(
     return result
 
 
+def _figure(figure: Figure, step: Step) -> float:
+    """A figure as a step has it; NaN where the step does not know it."""
+    if figure.quantity == "gap":
+        return step.gap.get(figure.point, math.nan)
+    if figure.quantity == "open":
+        closed = next(iter(step.zones.values())).closed  # in order from M
+        opened = int(np.argmax(closed)) if closed.any() else len(closed)
+        return float(opened) if closed[opened:].all() else -1.0
+    return step.points[figure.point][1]
+
+
 def _mesh(comm: MPI.Intracomm, case: Case, given: PlainMesh | None) -> PlainMesh | None:
     """The mesh on rank 0, with every group that the case asks for; None elsewhere."""
     from extrusion.mesh import case_mesh, on_root, read_mesh
@@ -346,7 +356,7 @@ def _mesh(comm: MPI.Intracomm, case: Case, given: PlainMesh | None) -> PlainMesh
         elif case.mesh is not None:
             return read_mesh(case.mesh, groups)
         else:
-            mesh = case_mesh(case.profile, case.size)
+            mesh = case_mesh(case.profile, case.mesh_size)
         present = [*mesh.cells, *mesh.facets]
         for group in groups:
             if group not in present:

@@ -24,6 +24,9 @@ log = logging.getLogger(__name__)
 MAX_CUTS = 8
 """Halvings of one increment before the step is given up."""
 
+CAUGHT = 1e-3
+"""A glissière that takes hold of a point farther than this (of the billet's radius) from the die is warned of."""
+
 PASSES = 30
 """Geometry passes of one increment (nodal contact) before it is cut."""
 
@@ -48,6 +51,7 @@ class Step:
     cuts: int
     residual: float  # N
     gap: dict[str, float]  # at the named slave points, mm
+    caught: dict[str, float]  # per bilateral zone: how far from the die the points were that it now holds for good, mm
     zones: dict[str, ContactState] = field(repr=False)
     x: PETSc.Vec = field(repr=False, compare=False)  # live: copy what must outlast the step
 
@@ -61,6 +65,7 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
     x, accepted = problem.x, problem.x.duplicate()
     x.set(0.0)
     problem.start(x)
+    caught = _caught(problem, 0.0)
     points = problem.named_points()
     t, rate = 0.0, x.duplicate()
     problem.shift_billet(rate, 1.0)  # du/dt that predicts the next increment: rigid at first, then that of the last one
@@ -78,6 +83,8 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
             if outcome.converged:
                 t, passes = goal, outcome.passes
                 problem.accept(x)
+                for zone, distance in _caught(problem, t).items():
+                    caught[zone] = max(distance, caught[zone])
                 rate.waxpy(-1.0, accepted, x)
                 rate.scale(1 / dt)
                 dt *= 2
@@ -108,9 +115,20 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
             cuts=cuts,
             residual=outcome.residual,
             gap=problem.point_gaps(x),
+            caught=caught,
             zones={term.pair.name: term.state(z) for term in problem.terms},
             x=x,
         )
+        caught = dict.fromkeys(caught, 0.0)
+
+
+def _caught(problem: Problem, t: float) -> dict[str, float]:
+    """What each bilateral zone has just taken hold of, with a warning where that was far from the die."""
+    out = {term.pair.name: term.caught for term in problem.terms if term.pair.closure == "bilateral"}
+    for zone, distance in out.items():
+        if distance > CAUGHT * problem.case.profile.radius and problem.comm.rank == 0:
+            log.warning("t = %.6g mm: zone %s holds points that were up to %.3g mm from the die", t, zone, distance)
+    return out
 
 
 @dataclass(frozen=True)

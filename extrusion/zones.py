@@ -69,6 +69,7 @@ class ContactTerm(Protocol):
 
     pair: Pair
     multipliers: int
+    caught: float  # mm: how far from the die the farthest point was that the last `start` or `accept` closed for good
 
     def start(self, z: Array) -> None:
         """Set the accepted state at t = 0 from the gap there."""
@@ -121,12 +122,14 @@ class NodalContact:
         self.at = first + np.arange(self.multipliers)
         self._kappa = np.full(len(self.nodes), float(np.mean(stiffness) * np.mean(np.abs(self.weight))))
         self._radius, self._interpenetrating = radius, interpenetrating
-        self.closed = np.zeros(len(self.nodes), dtype=bool)
+        self.closed, self.caught = np.zeros(len(self.nodes), dtype=bool), 0.0
         self._facet: Index | None = None
 
     def start(self, z: Array) -> None:
         self.pair_up(z)
-        self.closed = closed_at_start(self._g0 + self._apply(z), self._radius, self._interpenetrating)
+        gap = self._g0 + self._apply(z)
+        self.closed = closed_at_start(gap, self._radius, self._interpenetrating)
+        self.caught = _farthest(gap, self.closed)
 
     def pair_up(self, z: Array, settle: bool = False) -> None:
         pair = self.pair
@@ -177,12 +180,17 @@ class NodalContact:
         )
 
     def accept(self, z: Array) -> None:
-        if self.multipliers:
-            self.closed = (
-                self._law(z)[2] > 0 if self.pair.closure != "bilateral" else self.closed | (self._law(z)[2] > 0)
-            )
-            if self.pair.closure == "bilateral" and not self.pair.extended:
-                self.closed &= ~self._past
+        if not self.multipliers:
+            return
+        gap, _, dsc = self._law(z)
+        if self.pair.closure != "bilateral":
+            self.closed = dsc > 0
+            return
+        before = self.closed
+        self.closed = before | (dsc > 0)
+        if not self.pair.extended:
+            self.closed &= ~self._past
+        self.caught = _farthest(gap, self.closed & ~before)
 
     def state(self, z: Array) -> ContactState:
         x = self.X + _displacement(z, self.nodes)
@@ -225,11 +233,12 @@ class IntegratedContact:
     ) -> None:
         self.pair, self._k, self._material, self._theta = pair, stiffness, material, theta
         self._radius, self._interpenetrating, self._order = radius, interpenetrating, order
-        self.closed = np.zeros(len(pair.slave.nodes), dtype=bool)
+        self.closed, self.caught = np.zeros(len(pair.slave.nodes), dtype=bool), 0.0
 
     def start(self, z: Array) -> None:
-        held = closed_at_start(self._points(z, False)[0].gap, self._radius, self._interpenetrating)
-        self.closed = self._whole_facets(self._points(z, False)[0], held)
+        points = self._points(z, False)[0]
+        self.closed = self._whole_facets(points, closed_at_start(points.gap, self._radius, self._interpenetrating))
+        self.caught = _farthest(points.gap, self.closed[points.facet])
 
     def pair_up(self, z: Array, settle: bool = False) -> None:
         pass
@@ -369,7 +378,9 @@ class IntegratedContact:
         if self.pair.closure == "bilateral":
             points, S, _ = self._points(z, False)
             _, _, dsc, _ = self._law(z, points, S)
-            self.closed |= self._whole_facets(points, dsc > 0)
+            before = self.closed
+            self.closed = before | self._whole_facets(points, dsc > 0)
+            self.caught = _farthest(points.gap, (self.closed & ~before)[points.facet])
 
     def state(self, z: Array) -> ContactState:
         points, S, _ = self._points(z, False)
@@ -407,7 +418,7 @@ class MortarContact:
         self.multipliers = 0 if pair.closure == "check" else m + 1
         self.at = first + np.arange(self.multipliers)
         self._radius, self._interpenetrating = radius, interpenetrating
-        self.closed = np.zeros(m + 1, dtype=bool)
+        self.closed, self.caught = np.zeros(m + 1, dtype=bool), 0.0
 
     def start(self, z: Array) -> None:
         points = self._points(z, False)
@@ -415,6 +426,7 @@ class MortarContact:
         self.closed[:] = True
         np.logical_and.at(self.closed, points.facet, held.all(axis=1))
         np.logical_and.at(self.closed, points.facet + 1, held.all(axis=1))
+        self.caught = _farthest(points.gap, self.closed[points.facet] & self.closed[points.facet + 1])
 
     def pair_up(self, z: Array, settle: bool = False) -> None:
         pass
@@ -512,10 +524,12 @@ class MortarContact:
 
     def accept(self, z: Array) -> None:
         if self.multipliers and self.pair.closure == "bilateral":
-            dsc = self._law(z, self._points(z, False))[1]
-            self.closed |= dsc > 0
+            points, before = self._points(z, False), self.closed
+            self.closed = before | (self._law(z, points)[1] > 0)
             if not self.pair.extended:
                 self.closed &= self._share >= self.FACING
+            new = self.closed & ~before
+            self.caught = _farthest(points.gap, new[points.facet] & new[points.facet + 1])
 
     def state(self, z: Array) -> ContactState:
         points = self._points(z, False)
@@ -544,6 +558,11 @@ def _state_at(pair: Pair, z: Array, points: Points, stress: Array, closed: np.nd
         points.weight.ravel(),
         closed.ravel(),
     )
+
+
+def _farthest(gap: Array, of: np.ndarray) -> float:
+    """Largest distance from the die among some points, mm."""
+    return float(np.max(np.abs(gap[of]), initial=0.0))
 
 
 def nodal_weights(surface: Surface, axisymmetric: bool) -> Array:
