@@ -90,11 +90,12 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """An axisymmetric extrusion: profile, materials, zones, discretisation, loading and figures."""
+    """An extrusion: profile, materials, zones, discretisation, loading and figures."""
 
     name: str
     title: str = ""
     profile: Profile = SSNV504
+    space: Literal["axisymmetric", "plane strain"] = "axisymmetric"  # plane strain: per mm of thickness, half the scene
     billet: Elastic = BILLET
     die_material: Elastic = STEEL
     die: Literal["elastic", "rigid"] = "elastic"
@@ -123,6 +124,7 @@ class Case:
         _choice("order", self.order, (1, 2))
         _choice("theta", self.theta, (-1, 0, 1))
         _choice("die", self.die, ("elastic", "rigid"))
+        _choice("space", self.space, ("axisymmetric", "plane strain"))
         _choice("form", self.form, ("displacement", "mixed", None))
         if self.form == "mixed" and self.order == 1:
             raise InputError("form", "mixed", "needs order 2 (Taylor-Hood: quadratic displacement, linear pressure)")
@@ -165,6 +167,11 @@ class Case:
     def end(self) -> float:
         """Last t, mm."""
         return self.increments[-1][1]
+
+    @property
+    def axisymmetric(self) -> bool:
+        """Whether r = 0 is an axis of revolution (else a plane of symmetry)."""
+        return self.space == "axisymmetric"
 
     @property
     def mixed(self) -> bool:
@@ -217,6 +224,7 @@ def to_dict(case: Case) -> dict[str, Any]:
     out = {
         "name": case.name,
         "title": case.title,
+        "space": case.space,
         "method": case.method,
         "order": case.order,
         "form": case.form,

@@ -69,7 +69,7 @@ class Problem:
 
     def _assemble_bulk(self) -> None:
         msh, groups = self.tagged.msh, self.tagged.groups
-        degree = quadrature_degree(self.case.order, axisymmetric=True)
+        degree = quadrature_degree(self.case.order, axisymmetric=self.case.axisymmetric)
         dx = ufl.Measure("dx", msh, subdomain_data=self.tagged.cell_tags, metadata={"quadrature_degree": degree})
         u, v = ufl.TrialFunction(self.V), ufl.TestFunction(self.V)
         form: ufl.Form = 0
@@ -80,10 +80,10 @@ class Problem:
             measure = dx(groups[body])
             if body == "billet" and self.Q is not None:
                 p, q = ufl.TrialFunction(self.Q), ufl.TestFunction(self.Q)
-                blocks = mixed_virtual_work(u, p, v, q, lmbda, mu, measure, axisymmetric=True)
+                blocks = mixed_virtual_work(u, p, v, q, lmbda, mu, measure, axisymmetric=self.case.axisymmetric)
                 form += blocks[0][0]
             else:
-                form += virtual_work(u, v, lmbda, mu, measure, axisymmetric=True)
+                form += virtual_work(u, v, lmbda, mu, measure, axisymmetric=self.case.axisymmetric)
         if blocks:
             blocks[0][0] = form
             self.K = dolfinx.fem.petsc.assemble_matrix(fem.form(blocks), kind="mpi")
@@ -110,7 +110,7 @@ class Problem:
             for name, f in lame.items():
                 f.x.array[cells] = getattr(self._materials[body], name)
         position = ufl.SpatialCoordinate(msh)
-        stress = sigma(epsilon(u, position, axisymmetric=True), lame["lmbda"], lame["mu"])
+        stress = sigma(epsilon(u, position, axisymmetric=self.case.axisymmetric), lame["lmbda"], lame["mu"])
         expression = fem.Expression(von_mises(stress), DG0.element.interpolation_points)
         return u, fem.Function(DG0, name="von_mises"), expression
 
@@ -212,7 +212,9 @@ class Problem:
         ray = (zone.gap or ("closest" if case.method == "nodal" else "ray")) == "ray"
         # past its ends the die goes on straight; but what a glissière without a second zone pushes past F is let go
         extended = zone.contact != "bilateral" or len(case.zones) > 1
-        pair = Pair(zone.name, slave, master, AXIS[zone.ray], sign, zone.contact, ray, zone.smooth, extended)
+        pair = Pair(
+            zone.name, slave, master, AXIS[zone.ray], sign, zone.contact, ray, zone.smooth, extended, case.axisymmetric
+        )
         # the displacement form's stress, which Nitsche's term bounds, stiffens towards nu = 1/2; a pressure does not
         nu = material.nu if case.method in ("nitsche", "penalty") and not case.mixed else REFERENCE_NU
         k = stiffness(case.contact_gamma, material.E, nu, slave.length)
