@@ -193,6 +193,38 @@ def plot(folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder 
 
 
 @app.command()
+def study(
+    name: Annotated[str, typer.Argument(metavar="hard-cases", help="Which study.")] = "hard-cases",
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of its table and picture.")] = Path("results/study"),
+) -> None:
+    """Run a study, or what is left of it (about an hour); writes a table as it goes, and a picture."""
+    if name != "hard-cases":
+        raise InputError("study", name, "the only study is hard-cases")
+    from extrusion.check import require_dolfinx
+
+    require_dolfinx()
+    from extrusion import study as hard_cases
+
+    if _rank() != 0:
+        return
+    path = out / "hard-cases.csv"
+    _check_writable("out", path)
+
+    def tell(number: int, of: int, cell: hard_cases.Cell, outcome: hard_cases.Outcome) -> None:
+        which = f"{cell.problem} {cell.die} {cell.method} P{cell.order} nu {cell.nu:g} {cell.increment:g} mm"
+        print(f"{number} of {of}: {which}: {outcome.status} {outcome.note}", file=sys.stderr)
+
+    rows = hard_cases.run(path, tell)
+    table = Table(box=SIMPLE_HEAD, padding=0)
+    for column in ("part, method", "cells", "converged", "excluded", "failed"):
+        table.add_column(column, justify="right")
+    for row in hard_cases.summary(rows):
+        table.add_row(*map(str, row))
+    Console().print(table)
+    hard_cases.draw(rows, path.with_suffix(".png"))
+
+
+@app.command()
 def mesh(
     case: CaseName = "A",
     size: Annotated[

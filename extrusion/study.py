@@ -85,7 +85,7 @@ class Outcome:
     reaction_error: float = float("nan")  # largest, of max(7.8e5 N, its size)
     tension: float = float("nan")  # largest pull on a unilateral point, MPa
     penetration: float = float("nan")  # deepest contact point, mm
-    imbalance: float = float("nan")  # |ram + die| over the larger of 1 N and the ram's force
+    imbalance: float = float("nan")  # |ram + die|, of max(7.8e5 N, the ram's force)
 
 
 def cells() -> Iterator[Cell]:
@@ -139,7 +139,8 @@ def solve(cell: Cell) -> Outcome:
     try:
         for step in steps(problem, newton, case.times()):
             found.append(step)
-            imbalance = max(imbalance, abs(step.reaction + step.die_reaction) / max(1.0, abs(step.reaction)))
+            scale = max(REACTION_SCALE, abs(step.reaction))
+            imbalance = max(imbalance, abs(step.reaction + step.die_reaction) / scale)
             for term in problem.terms:
                 state = step.zones[term.pair.name]
                 if term.pair.closure == "unilateral":
@@ -220,6 +221,56 @@ def table(path: Path) -> list[dict[str, Any]]:
 
     with path.open(newline="", encoding="utf-8") as file:
         return [{name: value(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """One picture of a study's table: a square a cell, its shade the iterations a step, crosses where it failed."""
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 10), layout="constrained")
+    layout = figure.subplot_mosaic([["1", "1"], ["2", "3"]], height_ratios=(1.25, 1), width_ratios=(1.6, 1))
+    axes = [layout[part] for part in "123"]
+    titles = (
+        "1. nitsche and mortar: form, size and Poisson's ratio",
+        "2. every method and order (nu = 0.45, 4 mm)",
+        "3. gamma, 5 mm steps (nu = 0.45, 4 mm)",
+    )
+    keys: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
+        (("method", "form", "size", "problem"), ("nu", "die", "increment")),
+        (("method", "order"), ("problem", "die", "increment")),
+        (("method", "theta", "order", "die"), ("gamma",)),
+    )
+    image = None
+    for part, (axis, title, (down, across)) in enumerate(zip(axes, titles, keys, strict=True), start=1):
+        mine = [row for row in rows if row["part"] == part]
+        axis.set_title(title, loc="left", fontsize=10)
+        if not mine:
+            continue
+        labels_y = list(dict.fromkeys(tuple(row[name] for name in down) for row in mine))
+        labels_x = list(dict.fromkeys(tuple(row[name] for name in across) for row in mine))
+        mean = np.full((len(labels_y), len(labels_x)), np.nan)
+        for row in mine:
+            at = labels_y.index(tuple(row[n] for n in down)), labels_x.index(tuple(row[n] for n in across))
+            if row["status"] == "converged":
+                mean[at] = row["iterations"] / max(1, row["steps"])
+            else:
+                bad = row["status"] in ("failed", "lost")
+                axis.plot(at[1], at[0], "x" if bad else ".", color="red" if bad else "0.6", ms=6 if bad else 3)
+        axis.imshow(np.isnan(mean), cmap=ListedColormap(["white", "0.93"]), aspect="auto", vmin=0, vmax=1)
+        image = axis.imshow(mean, cmap="viridis", aspect="auto", vmin=0, vmax=20)
+        axis.set_yticks(range(len(labels_y)), [" ".join(map(_short, label)) for label in labels_y], fontsize=7)
+        axis.set_xticks(range(len(labels_x)), [" ".join(map(_short, label)) for label in labels_x], fontsize=6)
+        axis.tick_params(axis="x", rotation=90)
+    if image is not None:
+        figure.colorbar(
+            image, ax=axes, label="linear solves a step (dot: excluded or refused beforehand, cross: failed)"
+        )
+    figure.savefig(path, dpi=110)
+
+
+def _short(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _key(row: dict[str, Any]) -> tuple[Any, ...]:
