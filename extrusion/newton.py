@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass
 
 from petsc4py import PETSc
@@ -51,11 +52,15 @@ class Newton:
         snes = PETSc.SNES().create(problem.comm)
         snes.setOptionsPrefix("extrusion_")
         snes.setType("newtonls")
-        snes.setFunction(lambda _, x, f: self._residual(x, f), self._f)
-        snes.setJacobian(self._tangent, self.A)
-        snes.setConvergenceTest(self._test)
+        # SNES holds its callbacks in C, where no garbage collector looks: they must not hold this object, or neither it
+        # nor the problem, with its communicators, would ever go
+        me = weakref.proxy(self)
+        self._hand_over = lambda snes, x, A, P: me._tangent(x)
+        snes.setFunction(lambda snes, x, f: me._residual(x, f), self._f)
+        snes.setJacobian(self._hand_over, self.A)
+        snes.setConvergenceTest(lambda snes, it, norms: me._test(it, norms))
         snes.getLineSearch().setType("basic")
-        snes.setLineSearchPreCheck(self._shorten)
+        snes.setLineSearchPreCheck(lambda x, y, *_: me._shorten(x, y))
         ksp = snes.getKSP()
         ksp.setType("preonly")
         pc = ksp.getPC()
@@ -63,15 +68,14 @@ class Newton:
         pc.setFactorSolverType("mumps")
         snes.setFromOptions()
         self.snes = snes
-        self._known: tuple[int, PETSc.Vec] | None = None
         self.history: list[float] = []
 
-    def _tangent(self, snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, _: PETSc.Mat) -> None:
+    def _tangent(self, x: PETSc.Vec) -> None:
         """Hand SNES the tangent; where its pattern has grown it is a new matrix, which the linear solve then takes."""
         A = self.problem.tangent(x, self._update < self._near)
         if A != self.A:
             self._last_A, self.A = self.A, A  # SNES still looks at the old one on its way out of this call
-            snes.setJacobian(self._tangent, A)
+            self.snes.setJacobian(self._hand_over, A)
 
     def _residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         if self._fresh:  # the line search has just evaluated it here
@@ -82,7 +86,7 @@ class Newton:
 
     _fresh = False
 
-    def _shorten(self, x: PETSc.Vec, y: PETSc.Vec, *_: object) -> bool:
+    def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Scale the update y to the best of 1, 1/2, 1/4; SNES then takes x - y whole."""
         before = self.history[-1]
         best, norm = 0.0, np.inf
@@ -107,7 +111,7 @@ class Newton:
         self._update = self.problem.largest_displacement(y)
         return best != 1.0
 
-    def _test(self, snes: PETSc.SNES, it: int, norms: tuple[float, float, float]) -> int:
+    def _test(self, it: int, norms: tuple[float, float, float]) -> int:
         norm = norms[2]
         self.history.append(norm)
         reason = PETSc.SNES.ConvergedReason

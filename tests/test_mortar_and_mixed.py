@@ -1,6 +1,8 @@
 """Mortar contact, the displacement-pressure form, the least gamma, and what a glissière takes hold of."""
 
+import gc
 import logging
+import weakref
 from dataclasses import replace
 
 from mpi4py import MPI
@@ -125,3 +127,12 @@ def test_linear_triangles_are_warned_of(caplog: pytest.LogCaptureFixture) -> Non
     case = replace(problems()["unilateral"], order=1, die="rigid", size=4.0)
     Problem(case, case_mesh(case.profile, 4.0), MPI.COMM_SELF)
     assert "lock" in caplog.text
+
+
+def test_a_problem_goes_when_it_is_let_go() -> None:
+    """A cycle through PETSc keeps every problem, and a notebook or study runs out of communicators."""
+    problem = solved(replace(problems()["unilateral"], die="rigid", size=4.0), [10.0])
+    alive = weakref.ref(problem)
+    del problem
+    gc.collect()
+    assert alive() is None
