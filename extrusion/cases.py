@@ -148,6 +148,10 @@ class Case:
                 raise InputError(
                     f"zones.{zone.name}.slave", "die", "a rigid die has no stress: let the billet be slave"
                 )
+            if self.method == "mortar" and (zone.gap == "closest" or zone.slave == "die"):
+                raise InputError(
+                    f"zones.{zone.name}", self.method, "measures the ray gap on the billet: set slave and gap so"
+                )
             if zone.die == "cone" and not self.profile.cone:
                 raise InputError(f"zones.{zone.name}.die", "cone", "the profile names no cone")
         if not self.increments:
@@ -215,8 +219,9 @@ class Case:
         return replace(self, increments=(*rows, (self.increments[len(rows)][0], end)))
 
     def with_contact(self, contact: Closure) -> Case:
-        """The same case with every zone unilateral, bilateral or only checked."""
-        return replace(self, zones=tuple(replace(zone, contact=contact) for zone in self.zones))
+        """The same case with every zone unilateral, bilateral or only checked; figures that no longer apply go."""
+        zones = tuple(replace(zone, contact=contact) for zone in self.zones)
+        return replace(self, zones=zones, figures=self.figures if contact == "check" or zones == self.zones else ())
 
 
 def to_dict(case: Case) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,18 +42,18 @@ class Surface:
     tabulate: Callable[[int, Array], Array] | None = None  # basix tabulate of the cell's element
     pressure_cols: Index | None = None  # (m, 3) where z holds the cell's pressures (displacement-pressure form)
 
-    @property
+    @cached_property
     def length(self) -> Array:
         """Facet lengths, mm, ``shape=(m,)``."""
         return np.asarray(np.linalg.norm(self.X[:, 1] - self.X[:, 0], axis=1))
 
-    @property
+    @cached_property
     def normal(self) -> Array:
         """Outward unit normals in the reference position, ``shape=(m, 2)``."""
         t = (self.X[:, 1] - self.X[:, 0]) / self.length[:, None]
         return self.side * np.stack([t[:, 1], -t[:, 0]], axis=1)
 
-    @property
+    @cached_property
     def node_numbers(self) -> Index:
         """Distinct nodes in order along the curve."""
         along = np.column_stack([self.nodes[:, 0], *self.nodes[:, 2:].T, self.nodes[:, 1]]).ravel()
@@ -101,6 +102,13 @@ def shape(xi: Array, k: int, derivative: int = 0) -> Array:
         (4 * one, 4 * one, -8 * one),
     ]
     return np.stack(table3[derivative], axis=-1)
+
+
+@cache
+def gauss(order: int) -> tuple[Array, Array]:
+    """Points and weights of Gauss's rule on [0, 1]."""
+    s, omega = np.polynomial.legendre.leggauss(order)
+    return (s + 1) / 2, omega / 2
 
 
 def invert(values: Array, target: Array) -> Array:
@@ -190,8 +198,9 @@ def ray_points(
     # 1. pieces: each slave facet, cut where it passes a die vertex (a facet that has turned over passes them backwards)
     ends = xs[:, :2, p]
     forward = ends[:, 0] <= ends[:, 1]
-    low = np.searchsorted(vertex_p, ends.min(axis=1), side="right")
-    high = np.searchsorted(vertex_p, ends.max(axis=1), side="left")
+    resting = 1e-12 * np.abs(vertex_p).max()  # a vertex this close to a facet's end is there, and cuts no sliver off
+    low = np.searchsorted(vertex_p, ends.min(axis=1) + resting, side="right")
+    high = np.searchsorted(vertex_p, ends.max(axis=1) - resting, side="left")
     cuts = np.maximum(high - low, 0)
     facet = np.repeat(np.arange(len(xs)), cuts + 1)
     nth = np.arange(len(facet)) - np.repeat(np.cumsum(cuts + 1) - (cuts + 1), cuts + 1)
@@ -209,8 +218,7 @@ def ray_points(
     outside = (after | (opposite < 0))[:, None]
 
     # 2. points and weights on the reference slave facet
-    s, omega = np.polynomial.legendre.leggauss(order)
-    s, omega = (s + 1) / 2, omega / 2
+    s, omega = gauss(order)
     width = xi1 - xi0
     xi = xi0[:, None] + width[:, None] * s
     X, t = slave.X[facet], slave.X[facet, 1] - slave.X[facet, 0]
@@ -290,6 +298,14 @@ def ray_points(
         dxi=dxi,
         dweight=dweight,
     )
+
+
+def least_gap(slave: Surface, die: Surface, z: Array, axis: int, sign: float) -> float:
+    """A lower bound of the ray gap anywhere, from the extent of both surfaces along the ray, mm (nodes)."""
+    u = z.reshape(-1, 2)
+    x_s = slave.X[..., axis] + u[slave.nodes, axis]
+    x_d = die.X[..., axis] + u[die.nodes, axis]
+    return float(np.min(sign * x_d) - np.max(sign * x_s))
 
 
 def _reference_slope(die: Surface, axis: int) -> Array:

@@ -50,7 +50,10 @@ class Problem:
     def __init__(self, case: Case, mesh: PlainMesh | None, comm: MPI.Intracomm = MPI.COMM_WORLD) -> None:
         self.case, self.comm = case, comm
         if case.order == 1 and case.billet.nu >= LOCKING_FROM and case.method != "nodal" and comm.rank == 0:
-            log.warning("order = 1 at nu = %g: linear triangles lock, the reaction is far too low", case.billet.nu)
+            log.warning(
+                "order = 1 at nu = %g: linear triangles lock: pressure and reaction are far off, use order 2",
+                case.billet.nu,
+            )
         on_root(comm, lambda: check_profile(mesh, case.profile) if mesh else None)
         bodies = ("billet", "die") if case.die == "elastic" else ("billet",)
         self.tagged: TaggedMesh = distribute(comm, mesh, bodies)
@@ -86,9 +89,8 @@ class Problem:
                 form += virtual_work(u, v, lmbda, mu, measure, axisymmetric=self.case.axisymmetric)
         if blocks:
             blocks[0][0] = form
-            self.K = dolfinx.fem.petsc.assemble_matrix(fem.form(blocks), kind="mpi")
-        else:
-            self.K = dolfinx.fem.petsc.assemble_matrix(fem.form(form))
+        self._bulk_form = fem.form(blocks or form)
+        self.K = dolfinx.fem.petsc.assemble_matrix(self._bulk_form, kind="mpi" if blocks else None)
         self.K.assemble()
 
     def stress_fields(self, x: PETSc.Vec) -> dict[str, fem.Function]:
@@ -323,6 +325,10 @@ class Problem:
         mine = float(np.max(np.abs(x.array_r[: self._owned]), initial=0.0))
         return float(self.comm.allreduce(mine, op=MPI.MAX)) if self.comm.size > 1 else mine
 
+    def forget_pattern(self) -> None:
+        """Let go of the contact pairs met so far: the tangent's pattern is the bulk's again."""
+        self._tangent.reset()
+
     def tangent_without_contact(self) -> PETSc.Mat:
         """The bulk's tangent, with identity at the supports (and nothing yet for the multipliers)."""
         none = np.zeros(0, dtype=np.int64)
@@ -509,7 +515,8 @@ class TangentMatrix:
     """Constant bulk plus changing contact entries in one PETSc matrix, held by rows.
 
     The pattern grows when contact meets a new pair of nodes; as long as it does not, the symbolic factorisation is
-    kept. Held rows and columns are those of the identity.
+    kept; `reset`, at each increment, lets go of what the billet has left behind. Held rows and columns are those of the
+    identity.
     """
 
     def __init__(
@@ -538,13 +545,19 @@ class TangentMatrix:
             float(np.max(np.abs(data), initial=1.0)),
         )
         self._bulk_keys, self._bulk = keys, data
-        self._set_pattern(_sorted_distinct(np.concatenate([keys, own])))
+        self._least_keys = _sorted_distinct(np.concatenate([keys, own]))
+        self.reset()
 
     def _set_pattern(self, keys: Index) -> None:
         self._keys = keys
         self._base = np.zeros(len(keys))
         self._base[np.searchsorted(keys, self._bulk_keys)] = self._bulk
         self._base[np.searchsorted(keys, self._held_keys)] = self._held_value
+
+    def reset(self) -> None:
+        """Back to the bulk's pattern and every diagonal entry."""
+        self._set_pattern(self._least_keys)
+        self._A = None
 
     def _create(self) -> PETSc.Mat:
         rows, cols = self._keys // self._n + self._row0, self._keys % self._n

@@ -22,7 +22,7 @@ from extrusion.zones import ContactState
 log = logging.getLogger(__name__)
 
 MAX_CUTS = 8
-"""Halvings of one increment before the step is given up."""
+"""Halvings in a row before the step is given up."""
 
 CAUGHT = 1e-3
 """A glissière that takes hold of a point farther than this (of the billet's radius) from the die is warned of."""
@@ -71,13 +71,14 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
     problem.shift_billet(rate, 1.0)  # du/dt that predicts the next increment: rigid at first, then that of the last one
     for target in times:
         cuts = iterations = passes = 0
-        dt = target - t
+        dt, in_a_row = target - t, 0
         while t < target:
             goal = target if t + 1.001 * dt >= target else t + dt
             dt = goal - t
             x.copy(accepted)
             x.axpy(dt, rate)
             problem.drive(x, goal)
+            problem.forget_pattern()
             outcome = _increment(problem, newton, accepted)
             iterations += outcome.iterations
             if outcome.converged:
@@ -87,16 +88,16 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
                     caught[zone] = max(distance, caught[zone])
                 rate.waxpy(-1.0, accepted, x)
                 rate.scale(1 / dt)
-                dt *= 2
+                dt, in_a_row = 2 * dt, 0
                 continue
-            cuts += 1
+            cuts, in_a_row = cuts + 1, in_a_row + 1
             dt /= 2
             rate.set(0.0)
             problem.shift_billet(rate, 1.0)
             place = problem.worst(x)
             accepted.copy(x)
             problem.pair_up(x)
-            if cuts > MAX_CUTS:
+            if in_a_row > MAX_CUTS:
                 raise StepError(
                     f"step to t = {goal:.6g} mm not solved after {cuts - 1} cuts: {outcome.reason}; {place}. "
                     f"{outcome.remedy}"
@@ -138,7 +139,7 @@ class _Attempt:
     passes: int
     residual: float
     reason: str
-    remedy: str = "Try a smaller --increment, a finer mesh, or --method nitsche"
+    remedy: str = "Try another --increment, a finer mesh, or --method nitsche or mortar on P2"
 
 
 def _increment(problem: Problem, newton: Newton, accepted: PETSc.Vec) -> _Attempt:

@@ -20,6 +20,8 @@ from extrusion.gap import (
     Points,
     Surface,
     closest_rows,
+    gauss,
+    least_gap,
     polyline_points,
     ray_gap,
     ray_points,
@@ -296,7 +298,7 @@ class IntegratedContact:
         return own, sc, dsc, k
 
     def add_residual(self, z: Array, R: Array) -> None:
-        if self.pair.closure == "check":
+        if self.pair.closure == "check" or (not self._theta and is_far(self.pair, z, self._radius)):
             return
         points, S, _ = self._points(z, False)
         own, sc, _, k = self._law(z, points, S)
@@ -306,7 +308,7 @@ class IntegratedContact:
         np.add.at(R, points.cols, force)
 
     def tangent(self, z: Array, geometric: bool) -> Triplets:
-        if self.pair.closure == "check":
+        if self.pair.closure == "check" or (not self._theta and is_far(self.pair, z, self._radius)):
             return _none()
         points, S, S_xi = self._points(z, geometric)
         own, sc, dsc, k = self._law(z, points, S)
@@ -352,9 +354,9 @@ class IntegratedContact:
             Triplets of ``G^T w S + S^T w G``, and the values of ``G^T w k G`` at the same places.
         """
         slave, K = self.pair.slave, self.pair.slave.cell_nodes.shape[1]
-        xi, omega = np.polynomial.legendre.leggauss(self._order)
+        xi, omega = gauss(self._order)
         facet = np.arange(len(slave.nodes))
-        at = np.broadcast_to((xi + 1) / 2, (len(facet), self._order))
+        at = np.broadcast_to(xi, (len(facet), self._order))
         assert self._material is not None
         normal = slave.normal[:, None]
         S, _ = stress_rows(slave, facet, at, normal, self._material.lmbda, self._material.mu, self.pair.axisymmetric)
@@ -364,7 +366,7 @@ class IntegratedContact:
             where = np.broadcast_to(2 * slave.local[:, None] + component, N.shape)
             np.put_along_axis(G, where, -normal[..., component, None] * N, axis=2)
         radius = slave.X[:, :1, 0] + at * (slave.X[:, 1:2, 0] - slave.X[:, :1, 0])
-        w = slave.length[:, None] * omega / 2 * (2 * np.pi * radius if self.pair.axisymmetric else 1.0)
+        w = slave.length[:, None] * omega * (2 * np.pi * radius if self.pair.axisymmetric else 1.0)
         cols = (2 * slave.cell_nodes[..., None] + np.arange(2)).reshape(-1, 2 * K)
         if slave.pressure_cols is not None:
             cols = np.concatenate([cols, slave.pressure_cols], axis=1)
@@ -418,6 +420,7 @@ class MortarContact:
         self.multipliers = 0 if pair.closure == "check" else m + 1
         self.at = first + np.arange(self.multipliers)
         self._radius, self._interpenetrating = radius, interpenetrating
+        self._total = vertex_weights(pair.slave, pair.axisymmetric)
         self.closed, self.caught = np.zeros(m + 1, dtype=bool), 0.0
 
     def start(self, z: Array) -> None:
@@ -442,39 +445,42 @@ class MortarContact:
         return self._k * float(np.linalg.norm(weight)) if self.multipliers else 0.0
 
     def _rows(self, points: Points) -> tuple[Array, Array, Array]:
-        """Weak gap (mm^3), facing weight (mm^2) of each row, and the point weights that count."""
+        """Weak gap (mm^3) of each row, the share of its weight that faces the die, and the point weights that count."""
         w = points.weight if self.pair.extended else np.where(points.past, 0.0, points.weight)
-        weak, facing, total = (np.zeros(len(self.closed)) for _ in range(3))
+        weak, facing = np.zeros(len(self.closed)), np.zeros(len(self.closed))
         for node, psi in ((points.facet, 1 - points.xi), (points.facet + 1, points.xi)):
             np.add.at(weak, node, (w * psi * points.gap).sum(axis=1))
             np.add.at(facing, node, (w * psi).sum(axis=1))
-            np.add.at(total, node, (points.weight * psi).sum(axis=1))
-        self._share = facing / total
-        return weak, total, w
+        return weak, facing / self._total, w
 
     def _law(self, z: Array, points: Points) -> tuple[Array, Array, Array, Array]:
-        weak, total, w = self._rows(points)
-        sc, dsc = project(total * z[self.at] + self._k * weak, self.pair.closure, self.closed)
+        weak, share, w = self._rows(points)
+        sc, dsc = project(self._total * z[self.at] + self._k * weak, self.pair.closure, self.closed)
         if not self.pair.extended:
-            free = self._share < self.FACING
+            free = share < self.FACING
             sc, dsc = np.where(free, 0.0, sc), np.where(free, 0.0, dsc)
-        return sc, dsc, total, w
+        return sc, dsc, share, w
 
     def add_residual(self, z: Array, R: Array) -> None:
         if not self.multipliers:
             return
+        if is_far(self.pair, z, self._radius):
+            R[self.at] -= self._total * z[self.at]
+            return
         points = self._points(z, False)
-        sc, _, total, w = self._law(z, points)
+        sc, _, _, w = self._law(z, points)
         lam = z[self.at]
         p = (1 - points.xi) * lam[points.facet, None] + points.xi * lam[points.facet + 1, None]
         np.add.at(R, points.cols, np.einsum("nq,nql->nl", w * p, points.G))
-        R[self.at] += sc - total * lam
+        R[self.at] += sc - self._total * lam
 
     def tangent(self, z: Array, geometric: bool) -> Triplets:
         if not self.multipliers:
             return _none()
+        if is_far(self.pair, z, self._radius):
+            return self.at, self.at, -self._total
         points = self._points(z, geometric)
-        _, dsc, total, w = self._law(z, points)
+        _, dsc, _, w = self._law(z, points)
         lam = z[self.at]
         f = points.facet
         on = (dsc[f] > 0) | (dsc[f + 1] > 0) | (lam[f] != 0) | (lam[f + 1] != 0)
@@ -519,15 +525,16 @@ class MortarContact:
         return (
             np.concatenate([rows.ravel(), self.at]),
             np.concatenate([across.ravel(), self.at]),
-            np.concatenate([J.ravel(), (dsc - 1.0) * total]),
+            np.concatenate([J.ravel(), (dsc - 1.0) * self._total]),
         )
 
     def accept(self, z: Array) -> None:
         if self.multipliers and self.pair.closure == "bilateral":
             points, before = self._points(z, False), self.closed
-            self.closed = before | (self._law(z, points)[1] > 0)
+            _, dsc, share, _ = self._law(z, points)
+            self.closed = before | (dsc > 0)
             if not self.pair.extended:
-                self.closed &= self._share >= self.FACING
+                self.closed &= share >= self.FACING
             new = self.closed & ~before
             self.caught = _farthest(points.gap, new[points.facet] & new[points.facet + 1])
 
@@ -567,8 +574,7 @@ def _farthest(gap: Array, of: np.ndarray) -> float:
 
 def nodal_weights(surface: Surface, axisymmetric: bool) -> Array:
     """Integral of each node's shape function over the reference surface (2 pi r ds, or ds), mm^2 or mm."""
-    xi, omega = np.polynomial.legendre.leggauss(3)
-    xi, omega = (xi + 1) / 2, omega / 2
+    xi, omega = gauss(3)
     N = shape(xi, surface.nodes.shape[1])
     r = N @ surface.X[..., 0, None]
     measure = surface.length[:, None] * omega * (2 * np.pi * r[..., 0] if axisymmetric else 1.0)
@@ -576,6 +582,30 @@ def nodal_weights(surface: Surface, axisymmetric: bool) -> Array:
     out = np.zeros(nodes.max() + 1)
     np.add.at(out, surface.nodes, measure @ N)
     return np.asarray(out[nodes])
+
+
+FAR = 0.1
+"""A unilateral zone whose gap is nowhere below this (of the billet's radius) is left out until it closes."""
+
+
+def is_far(pair: Pair, z: Array, radius: float) -> bool:
+    """Whether the surfaces are too far apart for contact, or for Nitsche's trial stress, whose k gap outweighs all."""
+    return (
+        pair.ray
+        and pair.closure == "unilateral"
+        and least_gap(pair.slave, pair.die, _even(z), pair.axis, pair.sign) > FAR * radius
+    )
+
+
+def vertex_weights(surface: Surface, axisymmetric: bool) -> Array:
+    """Integral of each vertex's linear function over the reference surface, in order, mm^2 or mm."""
+    xi, omega = gauss(2)
+    radius = surface.X[:, :1, 0] + xi * (surface.X[:, 1:2, 0] - surface.X[:, :1, 0])
+    measure = surface.length[:, None] * omega * (2 * np.pi * radius if axisymmetric else 1.0)
+    out = np.zeros(len(measure) + 1)
+    out[:-1] += measure @ (1 - xi)
+    out[1:] += measure @ xi
+    return out
 
 
 def facet_weights(surface: Surface, axisymmetric: bool) -> Array:
@@ -640,8 +670,7 @@ def _ray_rows(pair: Pair, nodes: Index, x: Array, z: Array) -> tuple[Array, Arra
 
 def _closest_integration_points(pair: Pair, z: Array, order: int) -> tuple[Points, Array]:
     slave = pair.slave
-    xi, omega = np.polynomial.legendre.leggauss(order)
-    xi, omega = (xi + 1) / 2, omega / 2
+    xi, omega = gauss(order)
     m, K = slave.cell_nodes.shape
     N = np.broadcast_to(shape(xi, slave.nodes.shape[1]), (m, order, slave.nodes.shape[1]))
     x = (N @ (slave.X + _displacement(z, slave.nodes))).reshape(-1, 2)

@@ -44,7 +44,9 @@ def test_a_is_the_sheets() -> None:
     [
         A,
         replace(A, name="mine", title='a "quoted" \\ title, größer', gamma=0.1 + 0.2, theta=-1, size=3.7, figures=()),
-        replace(A, mesh="/a mesh.msh", die="rigid", increments=((10, 15), (5, 20), (35, 155))).with_contact("bilateral"),
+        replace(A, mesh="/a mesh.msh", die="rigid", increments=((10, 15), (5, 20), (35, 155))).with_contact(
+            "bilateral"
+        ),
         replace(
             A, zones=(Zone(name="front", billet="front", die="cone", ray="y", slave="die", gap="ray", smooth=True),)
         ),

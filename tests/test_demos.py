@@ -1,0 +1,94 @@
+"""The demos and the README's first screen do what they say."""
+
+import os
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+from mpi4py import MPI
+
+import jupytext
+import pytest
+from nbclient import NotebookClient
+
+from extrusion import cases
+from extrusion.result import verify
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("name", "pictures"), [("case_a", 3), ("rigid_die_ufl", 0), ("hertz", 1), ("shrink_fit", 1)])
+@pytest.mark.timeout(240)
+def test_notebook(name: str, pictures: int, tmp_path: Path) -> None:
+    """A percent script runs as a notebook, its asserts hold, and its pictures are there to see."""
+    notebook = jupytext.read(ROOT / "demos" / f"{name}.py")
+    place = {"metadata": {"path": str(tmp_path)}}
+    NotebookClient(notebook, timeout=120, kernel_name="python3", resources=place).execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == pictures
+    for before, cell in zip(notebook.cells, notebook.cells[1:], strict=False):
+        assert "markdown" in (before.cell_type, cell.cell_type), f"no sentence before {cell.source!r}"
+
+
+def test_two_ranks() -> None:
+    """The command in the script's first line gives one table."""
+    launcher = Path(sys.executable).with_name("mpiexec")
+    if not launcher.exists() or (os.cpu_count() or 1) < 2 or MPI.COMM_WORLD.size > 1:
+        pytest.skip("no mpiexec beside this Python, or one core, or already under a launcher")
+    script = ROOT / "demos" / "case_a_mpi.py"
+    command = script.read_text().splitlines()[0].removeprefix("# ").split()
+    assert command == ["mpiexec", "-n", "2", "python", "demos/case_a_mpi.py"]
+    done = subprocess.run(
+        [launcher, "-n", "2", sys.executable, script], capture_output=True, text=True, timeout=120, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("2 ranks") == 1
+
+
+def test_readme_lines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The README's Python runs as it stands."""
+    monkeypatch.chdir(tmp_path)
+    (code,) = re.findall(r"^```python\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
+    assert len(code.splitlines()) <= 6
+    exec(code, {})
+    assert (tmp_path / "billet.png").stat().st_size > 10_000
+
+
+def test_readme_figures() -> None:
+    """The README's table holds every figure of every case, as computed now to 0.001 mm, and within its tolerance."""
+    told = {}
+    for names, contact, row in re.findall(r"^\| ([A-Z, ]+) \| (solved|check) \| (.*) \|$", README, flags=re.MULTILINE):
+        t, quantity, sheet, computed, _, tolerance = row.split(" | ")
+        for case in names.split(", "):
+            told[case, contact, float(t), quantity] = float(sheet), float(computed), float(tolerance)
+    found = {}
+    for case in cases.CASES.values():
+        for comparison in (one for result in verify(case) for one in result.figures()):
+            figure = comparison.figure
+            assert comparison.ok
+            key = case.name, figure.contact, figure.t, f"{figure.quantity}({figure.point})"
+            found[key] = figure.value, comparison.computed, 100 * figure.tolerance
+    assert told.keys() == found.keys()
+    for key, values in found.items():
+        assert told[key] == pytest.approx(values, rel=1e-12, abs=1e-3), key
+
+
+@pytest.mark.slow
+def test_readme_accuracy(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every run of the README's other table gets to its end, with the K (to 0.001 mm) and the reaction (1 kN) there."""
+    runpy.run_path(str(ROOT / "demos" / "accuracy_table.py"), run_name="__main__")
+    tables = []
+    for text in (README, capsys.readouterr().out):
+        _, elastic, rigid = re.split(r"^(?:Elastic|Rigid) die:$", text, flags=re.MULTILINE)
+        rows = [re.findall(r"^\| (n|p|m)(.*) \|$", table, flags=re.MULTILINE) for table in (elastic, rigid)]
+        tables.append([[cell.strip() for cell in "".join(row).split("|")] for table in rows for row in table])
+    told, found = tables
+    assert len(found) == 2 * 19
+    assert [row[:4] for row in told] == [row[:4] for row in found]
+    for old, new in zip(told, found, strict=True):
+        for column in range(5, 11):
+            values = [float(row[column].split()[0]) for row in (old, new) if row[0] != "method"]
+            assert values == [] or values[0] == pytest.approx(values[1], abs=1e-3 if column < 8 else 1), new

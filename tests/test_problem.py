@@ -1,0 +1,338 @@
+"""Whole scenes: states that are exact, balances, and what must not change the answer."""
+
+import gc
+import weakref
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scenes import FRONT, SIDE, billet_mesh, block, solve, straight_die
+
+from extrusion.cases import A, Case
+from extrusion.contact import stiffness
+from extrusion.elasticity import Elastic
+from extrusion.errors import InputError, StepError
+from extrusion.mesh import PlainMesh, case_mesh
+from extrusion.newton import Newton, Outcome
+from extrusion.problem import Problem
+from extrusion.stepping import Step, steps
+from extrusion.zones import ContactState
+
+LAWS: dict[str, dict[str, Any]] = {
+    "nodal": {"method": "nodal"},
+    "mortar": {"method": "mortar"},
+    "penalty": {"method": "penalty"},
+    "nitsche -1": {"method": "nitsche", "theta": -1, "gamma": 1.0},
+    "nitsche 0": {"method": "nitsche"},
+    "nitsche 1": {"method": "nitsche", "theta": 1, "gamma": 60.0},
+}
+CONSISTENT = [law for law in LAWS if law != "penalty"]
+BILATERAL = (replace(A.zones[0], contact="bilateral"), A.zones[1])  # the side held from t = 0
+
+
+def pressed(state: ContactState) -> np.ndarray:
+    """Points that weigh something (a node on the axis has no area, and no pressure)."""
+    return state.weight > 1e-9 * np.max(state.weight)
+
+
+def stored(problem: Problem, step: Step) -> float:
+    """Elastic energy, and that of the penalty's springs on the side, w p^2 / 2k."""
+    if problem.case.method == "nodal":
+        return step.energy
+    term, state = problem.terms[0], step.zones["1"]
+    billet = problem.case.billet
+    k = stiffness(problem.case.contact_gamma, billet.E, billet.nu, np.mean(term.pair.slave.length))
+    return step.energy + float(np.sum(state.weight * state.ray_pressure**2) / (2 * k))
+
+
+# -- exact states ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize(
+    ("law", "die", "divisions"),
+    [(law, "rigid", 7) for law in LAWS]
+    + [(law, "elastic", n) for law in LAWS for n in (4, 7, 3) if (law, n) not in (("nodal", 7), ("nodal", 3))],
+)
+def test_patch(die: str, divisions: int, law: str, order: int) -> None:
+    """A billet pressed on a block is a bar of two pieces: one pressure, whatever the nodes opposite its four facets.
+
+    The penalty gives way by p / k. Nodes against facets fail it where they do not match, and are tested matching.
+    """
+    E, length, other_E, thickness, gap, t = 5000.0, 20.0, 8000.0, 15.0, 0.5, 1.3
+    profile = block(radius=10, length=length, start=length + gap, end=length + gap + thickness, divisions=divisions)
+    nu = 0.3 if die == "rigid" else 0.0  # the block is clamped: it may not swell
+    case = Case(
+        name="patch", profile=profile, billet=Elastic(E, nu), die_material=Elastic(other_E, 0.0), die=die,
+        zones=(FRONT,), order=order, increments=((t, t),), **LAWS[law],
+    )  # fmt: skip
+    _, step = solve(case, billet_mesh(profile, 4, 6, (divisions, 3)), [t])
+    flexibility = length / E + (thickness / other_E if die == "elastic" else 0)
+    indentation = 1 / float(stiffness(10, E, nu, 2.5)) if law == "penalty" else 0.0
+    p = (t - gap) / (flexibility + indentation)
+    state = step.zones["2"]
+    assert_allclose(state.pressure[pressed(state)], p, rtol=1e-9)
+    assert step.reaction == pytest.approx(p * np.pi * 100, rel=1e-9)
+    assert_allclose(state.gap, -p * indentation, atol=1e-12)
+    assert step.points["K"] == pytest.approx((0, t - p * length / E), rel=1e-9)
+    assert step.points["L"] == pytest.approx((10 * nu * p / E, t - p * length / E), rel=1e-9)
+    assert step.energy == pytest.approx(p**2 * np.pi * 100 * flexibility / 2, rel=1e-9)
+
+
+@pytest.mark.parametrize("contact", ["unilateral", "bilateral"])
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("law", CONSISTENT)
+def test_confined_billet(law: str, order: int, contact: str) -> None:
+    """In a closed rigid tube its modulus is E (1-nu) / ((1+nu) (1-2nu)), and nu / (1-nu) of p is on its side."""
+    E, nu, t, length = 5000.0, 0.45, 0.5, 20.0
+    profile = straight_die(radius=10, length=length, bore=(10, 10), stop=length)
+    case = Case(
+        name="tube", profile=profile, billet=Elastic(E, nu), die="rigid", order=order,
+        zones=(replace(SIDE, contact=contact), FRONT), increments=((t, t),), **LAWS[law],
+    )  # fmt: skip
+    _, step = solve(case, billet_mesh(profile, 4, 6), [t])
+    p = E * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) * t / length
+    for zone, expected in (("1", nu / (1 - nu) * p), ("2", p)):
+        state = step.zones[zone]
+        assert_allclose(state.pressure[pressed(state)], expected, rtol=1e-9)
+    assert step.reaction == pytest.approx(p * np.pi * 100, rel=1e-9)
+
+
+@pytest.mark.parametrize("times", [[135.0, 135.7], [*np.arange(5.0, 136, 5), 135.7]], ids=["at once", "by 5 mm"])
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize(("law", "zones"), [("nodal", 1), *((law, 2) for law in CONSISTENT)])
+def test_billet_between_E_and_F(law: str, zones: int, order: int, times: list[float]) -> None:
+    """Squeezed by 2 mm in 50, free lengthwise: p = E d / ((1-nu) R), and K is 65 * 2 nu d / ((1-nu) R) ahead of t."""
+    case = replace(A, die="rigid", order=order, zones=BILATERAL[:zones], **LAWS[law])
+    _, step = solve(case, case_mesh(A.profile), times)
+    assert step.t == 135.7
+    assert step.points["K"][1] - step.t == pytest.approx(4.254545454545, abs=1e-10)
+    assert_allclose(step.zones["1"].pressure, 363.636363636, rtol=1e-9)
+    assert step.reaction == pytest.approx(0, abs=1e-4)  # N; it reaches 8e5 on the way
+    assert step.points["L"][0] == pytest.approx(-2, abs=1e-10)
+
+
+def test_billet_between_E_and_F_of_an_elastic_die() -> None:
+    """A ring of 48 to 60 mm held outside gives way: K - t = 4.2214 in plane strain."""
+    case = replace(A, zones=BILATERAL, **LAWS["nitsche 0"], order=2)
+    _, step = solve(case, case_mesh(A.profile), [100.0, 135.5])
+    assert step.points["K"][1] - step.t == pytest.approx(4.2214, abs=2e-3)
+    assert step.points["K"][1] - step.t < 4.25
+
+
+@pytest.mark.parametrize("contact", ["bilateral", "unilateral"])
+@pytest.mark.parametrize("law", CONSISTENT)
+def test_billet_caught_in_a_throat(law: str, contact: str) -> None:
+    """A bore of 10.2 mm with a throat of 9.8 at B: all of a 10 mm billet is pressed there. Past it, a sliding channel
+    holds it stretched by 0.2 mm, p = -E d / ((1-nu) R), and K lags; unilateral contact lets it go.
+    """
+    E, nu = 5000.0, 0.3
+    profile = straight_die(radius=10, length=20, bore=(10.2, 10.2), stop=90)
+    (name, r, y), *rest = profile.die
+    profile = replace(
+        profile, die=((name, r, y), ("B", 9.8, 30.0), ("C", 10.2, 45.0), *rest), bore=("A", "B", "C", "F"),
+        divisions=(("A", "B", 6), ("B", "C", 6), ("C", "F", 9)),
+    )  # fmt: skip
+    case = replace(
+        A, profile=profile, billet=Elastic(E, nu), die="rigid", order=2, zones=(replace(SIDE, contact=contact),),
+        **LAWS[law],
+    )  # fmt: skip
+    _, step = solve(case, billet_mesh(profile, 4, 8), np.arange(2.0, 53, 2))
+    p = -E * 0.2 / ((1 - nu) * 10) if contact == "bilateral" else 0.0
+    assert_allclose(step.zones["1"].pressure, p, rtol=1e-9, atol=1e-6)
+    assert step.points["K"][1] - step.t == pytest.approx(20 * 2 * nu * p / E, abs=1e-8)
+
+
+# -- balances --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("die", ["elastic", "rigid"])
+@pytest.mark.parametrize("law", LAWS)
+def test_axial_equilibrium(law: str, die: str) -> None:
+    """What pushes the rear face comes out at the die's supports, to the solver's tolerance."""
+    case = replace(A, die=die, **LAWS[law])
+    _, step = solve(case, case_mesh(A.profile), [20.0, 45.0])
+    assert abs(step.reaction) > 1e5
+    assert step.die_reaction == pytest.approx(-step.reaction, abs=1e-4)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("law", ["nodal", "penalty"])
+def test_ram_work_in_a_straight_taper_is_stored(law: str, order: int) -> None:
+    """Held to one inclined line the problem is linear: the trapezoidal sum of reaction dt is the energy, exactly."""
+    profile = straight_die(radius=10, length=20, bore=(10, 9), stop=50)
+    side = replace(SIDE, contact="bilateral", initial="interpenetrating")
+    case = replace(A, profile=profile, die="rigid", zones=(side,), order=order, **LAWS[law])
+    problem = Problem(case, billet_mesh(profile, 4, 6), MPI.COMM_SELF)
+    known = [(s.t, s.reaction, stored(problem, s)) for s in steps(problem, Newton(problem), [1.0, 4.0, 10.0])]
+    for (t0, R0, E0), (t1, R1, E1) in pairwise(known):
+        assert (R0 + R1) / 2 * (t1 - t0) == pytest.approx(E1 - E0, rel=1e-9)
+    assert known[-1][2] > 1e4
+
+
+@pytest.mark.parametrize("t", [22.3, 93.0])
+@pytest.mark.parametrize("order", [1, 2])
+def test_reaction_is_the_derivative_of_the_stored_energy(order: int, t: float) -> None:
+    """At the die's corners too, frictionless as it is: by central differences over 2 um, penalty, held side."""
+    case = replace(A, die="rigid", order=order, zones=BILATERAL, **LAWS["penalty"])
+    E = {}
+    for dt in (-1e-3, 0.0, 1e-3):
+        problem, step = solve(case, case_mesh(A.profile), [t / 2, t + dt])
+        E[dt] = stored(problem, step)
+        if dt == 0:
+            reaction = step.reaction
+    assert (E[1e-3] - E[-1e-3]) / 2e-3 == pytest.approx(reaction, rel=1e-5)
+
+
+def test_ram_work_of_the_default_method() -> None:
+    """Up to t = 60, round B and C: the sum of reaction dt is the elastic energy but for mesh and increment."""
+    case = replace(A, die="rigid", order=2, size=2.0, **LAWS["nitsche 0"]).with_increment(2.5, 60.0)
+    problem = Problem(case, case_mesh(case.profile, case.size), MPI.COMM_SELF)
+    t, R, work = 0.0, 0.0, 0.0
+    for step in steps(problem, Newton(problem), case.times()):
+        work += (R + step.reaction) / 2 * (step.t - t)
+        t, R = step.t, step.reaction
+    assert work == pytest.approx(step.energy, rel=0.02)
+
+
+@pytest.mark.parametrize("die", ["elastic", "rigid"])
+@pytest.mark.parametrize("order", [1, 2])
+def test_complementarity(order: int, die: str) -> None:
+    """Of nodal contact at every step: no pull, no overlap, no pressure across a gap."""
+    case = replace(A, die=die, order=order)
+    problem = Problem(case, case_mesh(A.profile), MPI.COMM_SELF)
+    opened = closed = 0
+    for step in steps(problem, Newton(problem), case.times()):
+        for state in step.zones.values():
+            on = pressed(state)
+            assert np.min(state.pressure[on]) >= 0
+            assert np.min(state.gap) > -1e-9
+            assert np.max(np.abs(state.pressure * state.gap)[on]) < 1e-6  # N/mm
+            opened, closed = opened + np.sum(state.gap[on] > 1e-3), closed + np.sum(state.pressure[on] > 1)
+    assert min(opened, closed) > 100
+
+
+def test_checked_contact_reports_the_overlap() -> None:
+    """Nothing holds the billet back: it moves rigidly, M ends 5 mm in the throat C-D, and 2 mm past E."""
+    problem = Problem(A.with_contact("check"), case_mesh(A.profile), MPI.COMM_SELF)
+    found = {step.t: step for step in steps(problem, Newton(problem), [100.0, 155.0])}
+    for t, gap in ((100.0, -5.0), (155.0, -2.0)):
+        assert found[t].gap["M"] == pytest.approx(gap, abs=1e-9)
+        assert found[t].points["K"] == pytest.approx((0, t), abs=1e-9)
+        assert found[t].reaction == pytest.approx(0, abs=1e-4)
+        assert found[t].energy == pytest.approx(0, abs=1e-2)  # N mm; it reaches 1e8
+
+
+# -- what must not matter --------------------------------------------------------------------------------------
+
+
+def test_increments_do_not_matter() -> None:
+    """Elastic, frictionless, and split at the corners: t = 155 in one increment or in 31."""
+    case = replace(A, die="rigid", order=2, size=2.0, **LAWS["nitsche 0"])
+    mesh = case_mesh(case.profile, case.size)
+    K = {
+        dt: solve(case, mesh, case.with_increment(dt, 155.0).times())[1].points["K"][1]
+        for dt in (5.0, 20.0, 50.0, 155.0)
+    }
+    assert max(K.values()) - min(K.values()) < 1e-8, K
+
+
+@pytest.mark.parametrize(("law", "order"), [("nodal", 1), ("penalty", 1), ("nitsche 0", 2)])
+def test_units_do_not_matter(law: str, order: int) -> None:
+    """The scene in metres and pascals: an absolute length hidden in the code would show."""
+    case, mesh, times = replace(A, order=order, **LAWS[law]), case_mesh(A.profile), np.array([20.0, 55, 75])
+    _, expected = solve(case, mesh, times)
+    profile = replace(
+        A.profile, die=tuple((name, r / 1e3, y / 1e3) for name, r, y in A.profile.die), radius=0.05, length=0.065
+    )
+    materials = {"billet": Elastic(5e9, 0.45), "die_material": Elastic(2e11, 0.3)}
+    mesh = PlainMesh(mesh.points / 1e3, mesh.cells, mesh.facets)
+    _, found = solve(replace(case, profile=profile, **materials), mesh, times / 1e3)
+    for name, u in expected.points.items():
+        assert_allclose(1e3 * np.array(found.points[name]), u, atol=1e-8, err_msg=name)
+    assert found.reaction == pytest.approx(expected.reaction, rel=1e-9)
+    assert found.energy == pytest.approx(expected.energy / 1e3, rel=1e-9)
+    assert (found.iterations, found.cuts) == (expected.iterations, expected.cuts)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_second_run_of_a_problem_is_the_first(law: str) -> None:
+    """Nothing of a run stays behind in the problem: not the pairing, not what a channel has caught."""
+    problem = Problem(replace(A, **LAWS[law]), case_mesh(A.profile), MPI.COMM_SELF)
+    K = [[s.points["K"] for s in steps(problem, Newton(problem), [20.0, 55.0])] for _ in range(2)]
+    assert_allclose(K[0], K[1], rtol=1e-12)
+
+
+def test_a_solver_that_is_done_with_is_freed() -> None:
+    """Else MPI ends the process at the 300th run of a study: it has 2048 communicators."""
+    problem = Problem(A, case_mesh(A.profile), MPI.COMM_SELF)
+    newton = Newton(problem)
+    list(steps(problem, newton, [20.0]))
+    alive = [weakref.ref(newton), weakref.ref(problem)]
+    del newton, problem
+    gc.collect()
+    assert [ref() for ref in alive] == [None, None]
+
+
+# -- when it goes wrong ----------------------------------------------------------------------------------------
+
+
+class Reluctant(Newton):
+    """Solves no more than 12 mm at once, and leaves a mess where it does not."""
+
+    solved = 0.0
+
+    def solve(self, x: PETSc.Vec) -> Outcome:
+        t = float(x.array_r[self.problem._driven[0]])
+        if t - self.solved > 12:
+            x.set(np.nan)
+            return Outcome(False, 3, np.inf, "too far")
+        self.solved = t
+        return super().solve(x)
+
+
+@pytest.mark.parametrize("law", ["nodal", "nitsche 0"])
+def test_an_increment_that_fails_is_cut_and_recovers(law: str) -> None:
+    """40 mm go 10, 10, 10, 10, after two cuts at first and one whenever it grows again; the 5 mm after them whole."""
+    case, mesh = replace(A, die="rigid", **LAWS[law]), case_mesh(A.profile)
+    _, expected = solve(case, mesh, [10.0, 20.0, 30.0, 40.0, 45.0])
+    problem = Problem(case, mesh, MPI.COMM_SELF)
+    cut, whole = steps(problem, Reluctant(problem), [40.0, 45.0])
+    assert (cut.t, cut.cuts) == (40.0, 4)
+    assert (whole.t, whole.cuts) == (45.0, 0)
+    assert cut.iterations > 4 * 3 + 4  # failed ones are counted
+    assert_allclose(whole.points["K"], expected.points["K"], atol=1e-8)
+    assert whole.energy == pytest.approx(expected.energy, rel=1e-8)
+
+
+def test_a_step_that_cannot_be_solved_says_where() -> None:
+    """Time, zone, place and remedy; the steps before are kept."""
+    problem = Problem(replace(A, **LAWS["nitsche 0"]), case_mesh(A.profile), MPI.COMM_SELF)
+    newton = Newton(problem)
+    run = steps(problem, newton, [5.0, 30.0])
+    assert next(run).t == 5.0
+    newton._max = 0
+    with pytest.raises(StepError, match=r"step to t = \S+ mm not solved after 8 cuts: .*zone 1.*\(r, y\) = .*Try"):
+        next(run)
+
+
+def test_a_billet_that_nothing_pushes_is_refused() -> None:
+    """Without the rear face it would be free to float."""
+    mesh = case_mesh(A.profile)
+    facets = {name: f for name, f in mesh.facets.items() if name != "rear"}
+    with pytest.raises(InputError, match="rear"):
+        Problem(A, PlainMesh(mesh.points, mesh.cells, facets), MPI.COMM_SELF)
+
+
+def test_a_torn_surface_is_refused() -> None:
+    """A side with a facet missing is no curve."""
+    mesh = case_mesh(A.profile)
+    torn = mesh.facets | {"side": np.delete(mesh.facets["side"], 4, axis=0)}
+    with pytest.raises(InputError, match="side"):
+        Problem(A, PlainMesh(mesh.points, mesh.cells, torn), MPI.COMM_SELF)
