@@ -337,7 +337,7 @@ class Problem:
     def round_off(self, x: PETSc.Vec) -> float:
         """Norm of the round-off in the residual at x, N.
 
-        Machine epsilon times the forces |K| |u| that cancel in it, and the contact stiffness times that of a position.
+        Four times machine epsilon times the forces |K| |u| that cancel in it and the contact stiffness times a position.
         """
         u, f = x.duplicate(), x.duplicate()
         u.array[:] = np.abs(x.array_r)
@@ -348,7 +348,7 @@ class Problem:
         f.destroy()
         farthest = float(np.max(np.abs(list(self.case.profile.points.values()))))
         in_gaps = sum(farthest * term.stiffness_norm() for term in self.terms)
-        return float(np.finfo(float).eps) * (norm + in_gaps)
+        return 4 * float(np.finfo(float).eps) * (norm + in_gaps)
 
     def _refuse_indefinite(self) -> None:
         """Refuse a gamma too small for the mesh, where contact can be lost in silence.
@@ -414,6 +414,16 @@ class Problem:
         z = self.gather(x)
         for term in self.terms:
             term.pair_up(z, settle)
+
+    @property
+    def may_settle(self) -> bool:
+        """Whether a solve that failed is worth another try with `pair_up` settling what may have flipped in it."""
+        return any(isinstance(term, MortarContact) and not term.pair.extended for term in self.terms)
+
+    def settled(self, x: PETSc.Vec) -> bool:
+        """Whether what zones settled in `pair_up` still holds at x."""
+        z = self.gather(x)
+        return all(term.settled(z) for term in self.terms)
 
     def accept(self, x: PETSc.Vec) -> None:
         """Make x the accepted state of every zone."""

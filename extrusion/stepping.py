@@ -22,7 +22,7 @@ from extrusion.zones import ContactState
 log = logging.getLogger(__name__)
 
 MAX_CUTS = 8
-"""Halvings in a row before the step is given up."""
+"""Halvings of an increment before it is given up."""
 
 CAUGHT = 1e-3
 """A glissière that takes hold of a point farther than this (of the billet's radius) from the die is warned of."""
@@ -71,7 +71,8 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
     problem.shift_billet(rate, 1.0)  # du/dt that predicts the next increment: rigid at first, then that of the last one
     for target in times:
         cuts = iterations = passes = 0
-        dt, in_a_row = target - t, 0
+        dt = target - t
+        least = dt / 2**MAX_CUTS
         while t < target:
             goal = target if t + 1.001 * dt >= target else t + dt
             dt = goal - t
@@ -88,16 +89,16 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
                     caught[zone] = max(distance, caught[zone])
                 rate.waxpy(-1.0, accepted, x)
                 rate.scale(1 / dt)
-                dt, in_a_row = 2 * dt, 0
+                dt *= 2
                 continue
-            cuts, in_a_row = cuts + 1, in_a_row + 1
+            cuts += 1
             dt /= 2
             rate.set(0.0)
             problem.shift_billet(rate, 1.0)
             place = problem.worst(x)
             accepted.copy(x)
             problem.pair_up(x)
-            if in_a_row > MAX_CUTS:
+            if dt < 0.999 * least:
                 raise StepError(
                     f"step to t = {goal:.6g} mm not solved after {cuts - 1} cuts: {outcome.reason}; {place}. "
                     f"{outcome.remedy}"
@@ -143,21 +144,30 @@ class _Attempt:
 
 
 def _increment(problem: Problem, newton: Newton, accepted: PETSc.Vec) -> _Attempt:
-    """Solve one predicted increment in place; with frozen pairing, by geometry passes (two at least, as the sheet)."""
+    """Solve one predicted increment in place; with frozen pairing, by geometry passes (two at least, as the sheet).
+
+    Without, once is enough, unless a mortar row that is just leaving the die flips between held and let go: then these
+    rows are frozen, and may only grow in number.
+    """
     x = problem.x
     frozen = problem.case.method == "nodal" and problem.n_multipliers > 0
     iterations, change = 0, x.duplicate()
     seen: list[float] = []
     previous = x.duplicate()
-    for attempt in range(1, (PASSES if frozen else 1) + 1):
-        problem.pair_up(x, settle=attempt > SETTLE)
+    for attempt in range(1, PASSES + 1):
+        problem.pair_up(x, settle=attempt > (SETTLE if frozen else 1))
         x.copy(previous)
         outcome = newton.solve(x)
         iterations += outcome.iterations
         if not outcome.converged:
+            if attempt == 1 and problem.may_settle:
+                previous.copy(x)
+                continue
             return _Attempt(False, iterations, attempt, outcome.residual, outcome.reason)
         if not frozen:
-            break
+            if problem.settled(x):
+                break
+            continue
         change.waxpy(-1.0, previous, x)
         moved = problem.largest_displacement(change)
         change.waxpy(-1.0, accepted, x)

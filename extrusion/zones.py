@@ -82,6 +82,9 @@ class ContactTerm(Protocol):
         ``settle``: let points that rest on a die vertex stay with the facet they had.
         """
 
+    def settled(self, z: Array) -> bool:
+        """Whether what `pair_up` settled still holds at z."""
+
     def add_residual(self, z: Array, R: Array) -> None:
         """Add the term's forces (N) to R."""
 
@@ -147,6 +150,9 @@ class NodalContact:
             self._facet = found.facet
             self._past, self._cos = found.past, np.abs(found.normal @ pair.direction)
         self._g0 = g - self._apply(z)
+
+    def settled(self, z: Array) -> bool:
+        return True
 
     def stiffness_norm(self) -> float:
         return float(np.linalg.norm(self._kappa)) if self.multipliers else 0.0
@@ -245,9 +251,17 @@ class IntegratedContact:
     def pair_up(self, z: Array, settle: bool = False) -> None:
         pass
 
+    def settled(self, z: Array) -> bool:
+        return True
+
     def stiffness_norm(self) -> float:
-        weight = facet_weights(self.pair.slave, self.pair.axisymmetric)
-        return 0.0 if self.pair.closure == "check" else float(np.linalg.norm(self._k * weight))
+        if self.pair.closure == "check":
+            return 0.0
+        k, weight = self._k, facet_weights(self.pair.slave, self.pair.axisymmetric)
+        if self._material is not None:  # the slave's own stress, M / h a displacement, stands beside k times the gap
+            own = (self._material.lmbda + 2 * self._material.mu) / self.pair.slave.length / k
+            k = k * (1 + own + abs(self._theta) * own**2)
+        return float(np.linalg.norm(k * weight))
 
     def _whole_facets(self, points: Points, held: np.ndarray) -> np.ndarray:
         every = np.ones(len(self.closed), dtype=bool)
@@ -422,6 +436,7 @@ class MortarContact:
         self._radius, self._interpenetrating = radius, interpenetrating
         self._total = vertex_weights(pair.slave, pair.axisymmetric)
         self.closed, self.caught = np.zeros(m + 1, dtype=bool), 0.0
+        self._settled: np.ndarray | None = None  # rows let go, where that is not left to each iterate
 
     def start(self, z: Array) -> None:
         points = self._points(z, False)
@@ -432,7 +447,23 @@ class MortarContact:
         self.caught = _farthest(points.gap, self.closed[points.facet] & self.closed[points.facet + 1])
 
     def pair_up(self, z: Array, settle: bool = False) -> None:
-        pass
+        if not settle or self.pair.extended:
+            self._settled = None
+            return
+        lost = self._rows(self._points(z, False))[1] < self.FACING
+        self._settled = lost if self._settled is None else lost | self._settled
+
+    def settled(self, z: Array) -> bool:
+        if self._settled is None:
+            return True
+        lost = self._rows(self._points(z, False))[1] < self.FACING
+        return bool(np.all(self._settled[lost]))
+
+    def _free(self, share: Array) -> np.ndarray:
+        """Rows let go: those of which too little faces the die, or those settled beforehand."""
+        if self.pair.extended:
+            return np.zeros(len(share), dtype=bool)
+        return share < self.FACING if self._settled is None else self._settled
 
     def _points(self, z: Array, variation: bool) -> Points:
         pair = self.pair
@@ -453,13 +484,11 @@ class MortarContact:
             np.add.at(facing, node, (w * psi).sum(axis=1))
         return weak, facing / self._total, w
 
-    def _law(self, z: Array, points: Points) -> tuple[Array, Array, Array, Array]:
+    def _law(self, z: Array, points: Points) -> tuple[Array, Array, Array]:
         weak, share, w = self._rows(points)
         sc, dsc = project(self._total * z[self.at] + self._k * weak, self.pair.closure, self.closed)
-        if not self.pair.extended:
-            free = share < self.FACING
-            sc, dsc = np.where(free, 0.0, sc), np.where(free, 0.0, dsc)
-        return sc, dsc, share, w
+        free = self._free(share)
+        return np.where(free, 0.0, sc), np.where(free, 0.0, dsc), w
 
     def add_residual(self, z: Array, R: Array) -> None:
         if not self.multipliers:
@@ -468,7 +497,7 @@ class MortarContact:
             R[self.at] -= self._total * z[self.at]
             return
         points = self._points(z, False)
-        sc, _, _, w = self._law(z, points)
+        sc, _, w = self._law(z, points)
         lam = z[self.at]
         p = (1 - points.xi) * lam[points.facet, None] + points.xi * lam[points.facet + 1, None]
         np.add.at(R, points.cols, np.einsum("nq,nql->nl", w * p, points.G))
@@ -480,7 +509,7 @@ class MortarContact:
         if is_far(self.pair, z, self._radius):
             return self.at, self.at, -self._total
         points = self._points(z, geometric)
-        _, dsc, _, w = self._law(z, points)
+        _, dsc, w = self._law(z, points)
         lam = z[self.at]
         f = points.facet
         on = (dsc[f] > 0) | (dsc[f + 1] > 0) | (lam[f] != 0) | (lam[f + 1] != 0)
@@ -531,10 +560,7 @@ class MortarContact:
     def accept(self, z: Array) -> None:
         if self.multipliers and self.pair.closure == "bilateral":
             points, before = self._points(z, False), self.closed
-            _, dsc, share, _ = self._law(z, points)
-            self.closed = before | (dsc > 0)
-            if not self.pair.extended:
-                self.closed &= share >= self.FACING
+            self.closed = (before | (self._law(z, points)[1] > 0)) & ~self._free(self._rows(points)[1])
             new = self.closed & ~before
             self.caught = _farthest(points.gap, new[points.facet] & new[points.facet + 1])
 
