@@ -337,7 +337,7 @@ class Problem:
     def round_off(self, x: PETSc.Vec) -> float:
         """Norm of the round-off in the residual at x, N.
 
-        Four times machine epsilon times the forces |K| |u| that cancel in it and the contact stiffness times a position.
+        Four times machine epsilon times the forces |K| |u| that cancel in it, and the contact stiffness by a position.
         """
         u, f = x.duplicate(), x.duplicate()
         u.array[:] = np.abs(x.array_r)

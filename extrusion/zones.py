@@ -125,7 +125,7 @@ class NodalContact:
         self.weight = nodal_weights(slave, pair.axisymmetric)
         self.multipliers = 0 if pair.closure == "check" else len(self.nodes)
         self.at = first + np.arange(self.multipliers)
-        self._kappa = np.full(len(self.nodes), float(np.mean(stiffness) * np.mean(np.abs(self.weight))))
+        self._kappa = np.full(len(self.nodes), float(np.mean(stiffness * facet_weights(slave, pair.axisymmetric))))
         self._radius, self._interpenetrating = radius, interpenetrating
         self.closed, self.caught = np.zeros(len(self.nodes), dtype=bool), 0.0
         self._facet: Index | None = None
@@ -429,8 +429,10 @@ class MortarContact:
         interpenetrating: bool = False,
         order: int = 4,
     ) -> None:
-        self.pair, self._order, self._k = pair, order, float(np.mean(stiffness))
+        self.pair, self._order = pair, order
         m = len(pair.slave.nodes)
+        facets = np.broadcast_to(stiffness, m)
+        self._k = 0.5 * (np.append(facets[:1], facets) + np.append(facets, facets[-1:]))  # at the vertices
         self.multipliers = 0 if pair.closure == "check" else m + 1
         self.at = first + np.arange(self.multipliers)
         self._radius, self._interpenetrating = radius, interpenetrating
@@ -472,8 +474,7 @@ class MortarContact:
         )
 
     def stiffness_norm(self) -> float:
-        weight = facet_weights(self.pair.slave, self.pair.axisymmetric)
-        return self._k * float(np.linalg.norm(weight)) if self.multipliers else 0.0
+        return float(np.linalg.norm(self._k * self._total)) if self.multipliers else 0.0
 
     def _rows(self, points: Points) -> tuple[Array, Array, Array]:
         """Weak gap (mm^3) of each row, the share of its weight that faces the die, and the point weights that count."""
