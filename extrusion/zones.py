@@ -125,7 +125,7 @@ class NodalContact:
         self.weight = nodal_weights(slave, pair.axisymmetric)
         self.multipliers = 0 if pair.closure == "check" else len(self.nodes)
         self.at = first + np.arange(self.multipliers)
-        self._kappa = np.full(len(self.nodes), float(np.mean(stiffness * facet_weights(slave, pair.axisymmetric))))
+        self._kappa = np.full(len(self.nodes), float(np.mean(stiffness) * np.mean(np.abs(self.weight))))
         self._radius, self._interpenetrating = radius, interpenetrating
         self.closed, self.caught = np.zeros(len(self.nodes), dtype=bool), 0.0
         self._facet: Index | None = None
