@@ -11,8 +11,13 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_array
 
+import ufl
+from dolfinx import fem
+from dolfinx.fem.petsc import assemble_matrix
+from dolfinx.mesh import create_unit_cube, create_unit_square
+
 from extrusion.cases import BILLET, SIDE, Case
-from extrusion.elasticity import Elastic
+from extrusion.elasticity import Elastic, mixed_virtual_work
 from extrusion.errors import InputError
 from extrusion.mesh import case_mesh
 from extrusion.newton import Newton
@@ -136,3 +141,31 @@ def test_a_problem_goes_when_it_is_let_go() -> None:
     del problem
     gc.collect()
     assert alive() is None
+
+
+@pytest.mark.parametrize("space", ["axisymmetric", "plane strain", "3D"])
+def test_mixed_form_holds_a_uniform_state(space: str) -> None:
+    """u linear and mu p = -lambda div u leave a row of the pressure, or an inner one of the displacement off."""
+    material = Elastic(5000.0, 0.4999)
+    msh = create_unit_cube(MPI.COMM_SELF, 2, 2, 2) if space == "3D" else create_unit_square(MPI.COMM_SELF, 3, 3)
+    d, axisymmetric = msh.geometry.dim, space == "axisymmetric"
+    V, Q = fem.functionspace(msh, ("Lagrange", 2, (d,))), fem.functionspace(msh, ("Lagrange", 1))
+    (u, v), (p, q) = ((ufl.TrialFunction(W), ufl.TestFunction(W)) for W in (V, Q))
+    dx = ufl.dx(metadata={"quadrature_degree": 6})
+    blocks = mixed_virtual_work(u, p, v, q, material.lmbda, material.mu, dx, axisymmetric)
+    strain = np.array([0.01, -0.03, 0.02])[:d]
+    hoop = strain[0] if axisymmetric else 0.0
+    uniform, pressure = fem.Function(V), fem.Function(Q)
+    uniform.interpolate(lambda x: strain[:, None] * x[:d])
+    pressure.x.array[:] = -material.lmbda / material.mu * (strain.sum() + hoop)
+    A = assemble_matrix(fem.form(blocks), kind="mpi")
+    A.assemble()
+    matrix, n = A.convert("dense").getDenseArray(), len(uniform.x.array)
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-9)
+    forces = np.split(matrix @ np.concatenate([uniform.x.array, pressure.x.array]), [n])
+    x = V.tabulate_dof_coordinates()[:, :d]
+    inner = np.repeat(((x > 1e-9) & (x < 1 - 1e-9)).all(axis=1), d)
+    assert inner.any()
+    np.testing.assert_allclose(forces[1], 0.0, atol=1e-9 * material.lmbda)
+    np.testing.assert_allclose(forces[0][inner], 0.0, atol=1e-9 * material.lmbda)
+    assert np.abs(forces[0]).max() > 1.0
