@@ -197,7 +197,7 @@ def study(
     name: Annotated[str, typer.Argument(metavar="hard-cases", help="Which study.")] = "hard-cases",
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of its table and picture.")] = Path("results/study"),
 ) -> None:
-    """Run a study, or what is left of it (about an hour); writes a table as it goes, and a picture."""
+    """Run a study, or what is left of it (a quarter of an hour); writes a table as it goes, and a picture."""
     if name != "hard-cases":
         raise InputError("study", name, "the only study is hard-cases")
     from extrusion.check import require_dolfinx
