@@ -354,8 +354,8 @@ class Problem:
         """Refuse a gamma too small for the mesh, where contact can be lost in silence.
 
         With all contact facets closed, the symmetric method is coercive from a gamma_c on that depends on the mesh and
-        the element (25 to 33 for P2, 7 to 10 for P1): theta = 1 needs as much. theta = 0 is coercive from gamma_c / 4 on
-        and was found regular to about gamma_c / 90; it is refused below gamma_c / `SAFETY`. theta = -1 always is.
+        the element (25 to 33 for P2, 7 to 10 for P1): theta = 1 needs as much. theta = 0 is coercive from gamma_c / 4
+        on and was found regular to about gamma_c / 90; it is refused below gamma_c / `SAFETY`. theta = -1 always is.
 
         Raises:
             InputError: The smallest gamma is in the message.
