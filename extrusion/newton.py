@@ -44,7 +44,7 @@ class Newton:
         self.problem, self.atol = problem, atol
         self._max = max_iterations
         self._near = 0.02 * problem.case.profile.radius if near is None else near
-        self._update = np.inf
+        self._update, self._fresh = np.inf, False
         self._f = problem.x.duplicate()
         self._trial = problem.x.duplicate()
         self._trial_f = problem.x.duplicate()
@@ -83,8 +83,6 @@ class Newton:
             self._fresh = False
         else:
             self.problem.residual(x, f)
-
-    _fresh = False
 
     def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Scale the update y to the best of 1, 1/2, 1/4; SNES then takes x - y whole."""

@@ -175,6 +175,8 @@ def _increment(problem: Problem, newton: Newton, accepted: PETSc.Vec) -> _Attemp
             break
         seen.append(moved)
     else:
+        if not frozen:
+            return _Attempt(False, iterations, PASSES, outcome.residual, "rows that leave the die do not settle")
         two = len(seen) > 4 and np.isclose(seen[-1], seen[-3], rtol=1e-3)
         reason = (
             f"the pairing {'flips between two states' if two else 'does not settle'} (last change {seen[-1]:.3g} mm)"
