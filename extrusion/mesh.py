@@ -250,10 +250,10 @@ def sheet_mesh(profile: Profile) -> PlainMesh:
 def graded_mesh(profile: Profile, size: float) -> PlainMesh:
     """Mesh of element size h = `size` (mm) that is fine where contact is, by gmsh.
 
-    Billet: h on side and front, 0.15 h at K and L. Die: 2 h along bore and cone, 0.2 h at their vertices but
-    the entry. From there sizes grow with the distance: by 1.5 sqrt(h / radius) in the billet, so that its
-    inside is refined with h, and twice as fast in the die, which is stiff: at h = 1 that costs 5e-5 of the
-    die's strain energy, itself a small part of the whole.
+    Billet: h on side and front, 0.15 h at K, 0.05 h at L, where the pressure is singular when L is held on the
+    cone. Die: 2 h along bore and cone, 0.2 h at their vertices but the entry. From there sizes grow with the
+    distance: by 1.5 sqrt(h / radius) in the billet, so that its inside is refined with h, and twice as fast in the
+    die, which is stiff: at h = 1 that costs 5e-5 of the die's strain energy, itself a small part of the whole.
 
     Raises:
         InputError: If the size is not within radius/1000 and radius, or gmsh is missing.
@@ -266,7 +266,7 @@ def graded_mesh(profile: Profile, size: float) -> PlainMesh:
     edges = profile.edges
     contact = edges["bore"] + edges["cone"]
     growth = min(1.5 * math.sqrt(size / profile.radius), 0.5)
-    in_billet = [(edges["side"] + edges["front"], size), ((("K", "K"), ("L", "L")), 0.15 * size)]
+    in_billet = [(edges["side"] + edges["front"], size), ((("K", "K"),), 0.15 * size), ((("L", "L"),), 0.05 * size)]
     in_die = [(contact, 2 * size), (tuple((v, v) for _, v in contact), 0.2 * size)]
     with _gmsh() as gmsh:
         billet = _triangulate(gmsh, profile, profile.billet_edges, _size(profile, in_billet, growth))

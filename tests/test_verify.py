@@ -57,15 +57,19 @@ def test_increments_do_not_matter_with_an_elastic_die(method: str, problem: str)
 
 
 def test_error_bars_cover_the_levels() -> None:
-    """A reference whose finest level differs from the one before by more than it admits."""
+    """A reference whose finest level differs from the one before by more than it admits.
+
+    Its bars of K are below 6e-5, but where L is held on the cone (t = 10), at a singular point of the pressure.
+    """
     data = read()
-    for dies in data["problems"].values():
+    for problem, dies in data["problems"].items():
         for rows in dies.values():
             for row in rows:
                 assert len(row["levels"]) >= 4
                 assert abs(row["levels"][-1][1] - row["levels"][-2][1]) <= row["K_error"] * (1 + 1e-9)
                 assert abs(row["mortar"][2] - row["reaction"]) <= row["reaction_error"] * (1 + 1e-9)
-                assert row["K_error"] < 1e-4 * row["K"]
+                singular = problem != "unilateral" and row["t"] == 10
+                assert row["K_error"] < (1.2e-4 if singular else 6e-5) * row["K"]
 
 
 @pytest.mark.mpi
