@@ -42,9 +42,13 @@ def straight_die(
     )
 
 
-def block(*, radius: float, length: float, start: float, end: float, divisions: int = 7) -> Profile:
-    """A billet before a cylinder of the same radius, from y = start to end, held at its far end."""
-    die = (("F", radius, start), ("G", 0.0, start), ("H", 0.0, end), ("I", radius, end))
+def block(*, radius: float, length: float, start: float, end: float, divisions: int = 7, slope: float = 0.0) -> Profile:
+    """A billet before a block of the same radius, held at its far end; both its ends rise by the slope from the axis.
+
+    On the axis the block reaches from y = start to end.
+    """
+    rise = slope * radius
+    die = (("F", radius, start + rise), ("G", 0.0, start), ("H", 0.0, end), ("I", radius, end + rise))
     parts = (("F", "G", divisions),)
     return Profile(
         die=die, bore=("I", "F"), cone=("F", "G"), fixed=(("H", "I"),), radius=radius, length=length, divisions=parts
@@ -68,8 +72,9 @@ def billet_mesh(profile: Profile, columns: int, rows: int, die: tuple[int, int] 
     bodies, facets = {"billet": cells}, {names[side]: edge for side, edge in edges.items()}
     if die is not None:
         names = {"bottom": "cone", "right": "bore", "top": "fixed", "left": "die_axis"}
-        (radius, start), (_, end) = profile.points["F"], profile.points["I"]
+        (radius, rim), (_, start), (_, end) = (profile.points[name] for name in "FGH")
         more, cells, edges = grid(np.linspace(0, radius, die[0] + 1), np.linspace(start, end, die[1] + 1))
+        more[:, 1] += (rim - start) * more[:, 0] / radius
         bodies["die"] = cells + len(points)
         facets |= {names[side]: edge + len(points) for side, edge in edges.items()}
         points = np.vstack([points, more])

@@ -20,7 +20,9 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(("name", "pictures"), [("case_a", 3), ("rigid_die_ufl", 0), ("hertz", 1), ("shrink_fit", 1)])
+@pytest.mark.parametrize(
+    ("name", "pictures"), [("case_a", 3), ("rigid_die_ufl", 0), ("patch_test", 2), ("hertz", 1), ("shrink_fit", 1)]
+)
 @pytest.mark.timeout(240)
 def test_notebook(name: str, pictures: int, tmp_path: Path) -> None:
     """A percent script runs as a notebook, its asserts hold, and its pictures are there to see."""
