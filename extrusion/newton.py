@@ -9,7 +9,7 @@ from petsc4py import PETSc
 
 import numpy as np
 
-from extrusion.problem import Problem
+from extrusion.system import System
 
 REASONS = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 
@@ -39,7 +39,7 @@ class Newton:
     """
 
     def __init__(
-        self, problem: Problem, atol: float = 1e-6, max_iterations: int = 40, near: float | None = None
+        self, problem: System, atol: float = 1e-6, max_iterations: int = 40, near: float | None = None
     ) -> None:
         self.problem, self.atol = problem, atol
         self._max = max_iterations
@@ -61,11 +61,7 @@ class Newton:
         snes.setConvergenceTest(lambda snes, it, norms: me._test(it, norms))
         snes.getLineSearch().setType("basic")
         snes.setLineSearchPreCheck(lambda x, y, *_: me._shorten(x, y))
-        ksp = snes.getKSP()
-        ksp.setType("preonly")
-        pc = ksp.getPC()
-        pc.setType("lu")
-        pc.setFactorSolverType("mumps")
+        problem.set_solver(snes.getKSP())
         snes.setFromOptions()
         self.snes = snes
         self.history: list[float] = []

@@ -28,7 +28,8 @@ from extrusion.errors import InputError
 from extrusion.gap import Array, Index, Surface, polyline
 from extrusion.mesh import PlainMesh, TaggedMesh, check_profile, distribute, on_root
 from extrusion.surfaces import Trace, all_ranks, gather_trace
-from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact, Pair, gap_at_nodes
+from extrusion.system import System
+from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact, Pair
 
 log = logging.getLogger(__name__)
 
@@ -38,8 +39,8 @@ SAFETY = 32.0
 AXIS = {"r": 0, "y": 1}
 
 
-class Problem:
-    """One scene, discretised.
+class Problem(System):
+    """One scene, discretised; x holds all displacements (and pressures and multipliers), each rank its own.
 
     Args:
         case: The scene.
@@ -189,6 +190,9 @@ class Problem:
                 surfaces[zone.die] = polyline(curve, n, side)
                 n += len(curve)
         self._n_nodes = n
+        billet = np.concatenate([trace.cell_nodes.ravel() for g, trace in traces.items() if g in ("side", "front")])
+        self.z_in_billet = np.zeros(n, dtype=bool)  # nodes of z
+        self.z_in_billet[: len(self._live)] = np.isin(self._live, billet)
         with_pressure = [g for g in needs_cells if self.Q is not None and g in ("side", "front")]
         pressed = [traces[g].pressures.ravel() for g in with_pressure]
         self._live_pressures = np.unique(np.concatenate([*pressed, np.zeros(0, dtype=np.int64)]))
@@ -246,21 +250,21 @@ class Problem:
         pressures = in_x(self._live_pressures, 1)
         multipliers = self.n - self.n_multipliers + np.arange(self.n_multipliers)
         self.n_z = self._first_multiplier + self.n_multipliers
-        self._z_to_x = np.full(self.n_z, -1, dtype=np.int64)
-        self._z_to_x[: len(live)] = live
-        self._z_to_x[2 * self._n_nodes :] = np.concatenate([pressures, multipliers])
-        taken = self._z_to_x[self._z_to_x >= 0].astype(PETSc.IntType)
-        self._z_live = np.flatnonzero(self._z_to_x >= 0)
+        self.z_to_x = np.full(self.n_z, -1, dtype=np.int64)
+        self.z_to_x[: len(live)] = live
+        self.z_to_x[2 * self._n_nodes :] = np.concatenate([pressures, multipliers])
+        taken = self.z_to_x[self.z_to_x >= 0].astype(PETSc.IntType)
+        self._z_live = np.flatnonzero(self.z_to_x >= 0)
         source = PETSc.IS().createGeneral(taken, comm=PETSc.COMM_SELF)
         self._z_vec = PETSc.Vec().createSeq(len(taken))
         self._to_z = PETSc.Scatter().create(self.x, source, self._z_vec, None)
-        held = all_ranks(comm, self._held + self._row0)
-        self._z_held = np.isin(self._z_to_x, held)
-        mine = (self._z_to_x >= self._row0) & (self._z_to_x < self._row0 + self.n_local)
+        self.held = held = all_ranks(comm, self._held + self._row0)  # entries of x that the supports prescribe
+        self._z_held = np.isin(self.z_to_x, held)
+        mine = (self.z_to_x >= self._row0) & (self.z_to_x < self._row0 + self.n_local)
         self._z_mine = np.flatnonzero(mine)
-        self._x_mine = self._z_to_x[self._z_mine] - self._row0
-        self._z_free = ~self._z_held & (self._z_to_x >= 0)
-        self._z_row = mine & self._z_free
+        self._x_mine = self.z_to_x[self._z_mine] - self._row0
+        self.z_free = ~self._z_held & (self.z_to_x >= 0)
+        self._z_row = mine & self.z_free
         indptr, indices, data = self.K.getValuesCSR()
         self._K_wide = _widen(comm, self.n_local, self.n, indptr, indices, data)
         self._K_size = _widen(comm, self.n_local, self.n, indptr, indices, np.abs(data))
@@ -283,14 +287,45 @@ class Problem:
         """Move the whole billet along y by dt, mm."""
         x.array[self._billet_y] += dt
 
-    # -- residual and tangent --------------------------------------------------------------------------------
+    # -- what the condensed problem asks ---------------------------------------------------------------------
 
-    def contact_forces(self, z: Array) -> Array:
-        """Contact's part of the residual over z, N (and multiplier rows)."""
-        R = np.zeros(self.n_z)
-        for term in self.terms:
-            term.add_residual(z, R)
-        return R
+    @property
+    def bulk_size(self) -> tuple[int, int, int]:
+        """Rows of the bulk matrix and of its part on this rank, and the first of these."""
+        return self.n, self.n_local, self._row0
+
+    def bulk(self) -> PETSc.Mat:
+        """The bulk matrix with the identity at the supports and for the multipliers."""
+        last = self.comm.rank == self.comm.size - 1
+        own = self.n_local - self.n_multipliers + np.arange(self.n_multipliers) if last else np.zeros(0, dtype=np.int64)
+        return self._tangent.fill(own, own + self._row0, np.ones(len(own)))
+
+    def places_of(self, points: dict[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
+        """Global entries of x that hold the displacement of points given by rank and local block."""
+        first = self.comm.allgather(self._row0)
+        return {name: (first[rank] + 2 * block, first[rank] + 2 * block + 1) for name, (rank, block) in points.items()}
+
+    def drive_at(self, entries: Index) -> Array:
+        """What entries of x are when the billet is moved along y by 1."""
+        moved = all_ranks(self.comm, self._billet_y + self._row0)
+        return np.isin(entries, moved).astype(float)
+
+    def set_displacements(self, u: PETSc.Vec, t: float, multipliers: Array) -> None:
+        """Set x to u with the billet moved along y by t; the supports take their values."""
+        u.copy(self.x)
+        self.shift_billet(self.x, t)
+        self.drive(self.x, t)
+        if self.comm.rank == self.comm.size - 1:
+            self.x.array[self.n_local - self.n_multipliers :] = multipliers
+
+    @property
+    def z_on_rigid_die(self) -> np.ndarray:
+        """Axial entries of z on a rigid die."""
+        on = np.zeros(self.n_z, dtype=bool)
+        on[2 * len(self._live) + 1 : 2 * self._n_nodes : 2] = True
+        return on
+
+    # -- residual and tangent --------------------------------------------------------------------------------
 
     def forces(self, x: PETSc.Vec) -> PETSc.Vec:
         """Out-of-balance force of all dofs, N: at the supports their reactions, elsewhere the residual."""
@@ -317,8 +352,8 @@ class Problem:
         z = self.gather(x)
         parts = [term.tangent(z, geometric) for term in self.terms]
         rows, cols, values = (np.concatenate(part) for part in zip(*parts, strict=True))
-        keep = self._z_row[rows] & self._z_free[cols]
-        return self._tangent.fill(self._z_to_x[rows[keep]] - self._row0, self._z_to_x[cols[keep]], values[keep])
+        keep = self._z_row[rows] & self.z_free[cols]
+        return self._tangent.fill(self.z_to_x[rows[keep]] - self._row0, self.z_to_x[cols[keep]], values[keep])
 
     def largest_displacement(self, x: PETSc.Vec) -> float:
         """Largest displacement component in x on any rank, multipliers left out."""
@@ -328,6 +363,17 @@ class Problem:
     def forget_pattern(self) -> None:
         """Let go of the contact pairs met so far: the tangent's pattern is the bulk's again."""
         self._tangent.reset()
+
+    def set_solver(self, ksp: PETSc.KSP) -> None:
+        """MUMPS, anew for each tangent."""
+        ksp.setType("preonly")
+        pc = ksp.getPC()
+        pc.setType("lu")
+        pc.setFactorSolverType("mumps")
+
+    def recover(self, x: PETSc.Vec) -> PETSc.Vec:
+        """x itself."""
+        return x
 
     def tangent_without_contact(self) -> PETSc.Mat:
         """The bulk's tangent, with identity at the supports (and nothing yet for the multipliers)."""
@@ -339,22 +385,40 @@ class Problem:
 
         Four times machine epsilon times the forces |K| |u| that cancel in it, and the contact stiffness by a position.
         """
-        u, f = x.duplicate(), x.duplicate()
+        u = x.duplicate()
         u.array[:] = np.abs(x.array_r)
         u.array[self._owned :] = 0.0
+        norm = self._size(u)
+        u.destroy()
+        return self.round_off_at(norm)
+
+    def _size(self, u: PETSc.Vec) -> float:
+        """Norm of |K| u, N."""
+        f = u.duplicate()
         self._K_size.mult(u, f)
         norm = float(f.norm())
-        u.destroy()
         f.destroy()
+        return norm
+
+    def size_of_drive(self) -> float:
+        """Norm of the forces that cancel when the billet moves by 1 mm, N/mm."""
+        u = self.x.duplicate()
+        self.shift_billet(u, 1.0)
+        norm = self._size(u)
+        u.destroy()
+        return norm
+
+    def round_off_at(self, forces: float) -> float:
+        """Norm of the residual's round-off where forces of this norm (N) cancel in the bulk, N."""
         farthest = float(np.max(np.abs(list(self.case.profile.points.values()))))
         in_gaps = sum(farthest * term.stiffness_norm() for term in self.terms)
-        return 4 * float(np.finfo(float).eps) * (norm + in_gaps)
+        return 4 * float(np.finfo(float).eps) * (forces + in_gaps)
 
     def _refuse_indefinite(self) -> None:
         """Refuse a gamma too small for the mesh, where contact can be lost in silence.
 
         With all contact facets closed, the symmetric method is coercive from a gamma_c on that depends on the mesh and
-        the element (25 to 33 for P2, 7 to 10 for P1): theta = 1 needs as much. theta = 0 is coercive from gamma_c / 4
+        the element (27 to 36 for P2, 8 to 10 for P1): theta = 1 needs as much. theta = 0 is coercive from gamma_c / 4
         on and was found regular to about gamma_c / 90; it is refused below gamma_c / `SAFETY`. theta = -1 always is.
 
         Raises:
@@ -381,9 +445,9 @@ class Problem:
         for term in self.terms:
             if isinstance(term, IntegratedContact) and term.pair.closure != "check":
                 (i, j, fixed), with_k = term.closed_edge()
-                keep = self._z_row[i] & self._z_free[j]
-                rows.append(self._z_to_x[i[keep]] - self._row0)
-                cols.append(self._z_to_x[j[keep]])
+                keep = self._z_row[i] & self.z_free[j]
+                rows.append(self.z_to_x[i[keep]] - self._row0)
+                cols.append(self.z_to_x[j[keep]])
                 values.append((fixed + factor * with_k)[keep])
         if not rows:
             return False
@@ -403,34 +467,6 @@ class Problem:
 
     # -- reports ---------------------------------------------------------------------------------------------
 
-    def start(self, x: PETSc.Vec) -> None:
-        """Accepted contact state at t = 0."""
-        z = self.gather(x)
-        for term in self.terms:
-            term.start(z)
-
-    def pair_up(self, x: PETSc.Vec, settle: bool = False) -> None:
-        """Pair billet and die anew at x, for terms that freeze their pairing."""
-        z = self.gather(x)
-        for term in self.terms:
-            term.pair_up(z, settle)
-
-    @property
-    def may_settle(self) -> bool:
-        """Whether a solve that failed is worth another try with `pair_up` settling what may have flipped in it."""
-        return any(isinstance(term, MortarContact) and not term.pair.extended for term in self.terms)
-
-    def settled(self, x: PETSc.Vec) -> bool:
-        """Whether what zones settled in `pair_up` still holds at x."""
-        z = self.gather(x)
-        return all(term.settled(z) for term in self.terms)
-
-    def accept(self, x: PETSc.Vec) -> None:
-        """Make x the accepted state of every zone."""
-        z = self.gather(x)
-        for term in self.terms:
-            term.accept(z)
-
     def reactions(self, x: PETSc.Vec) -> tuple[float, float]:
         """Axial force of the rear face on the billet, and of the die's supports on the die, N, whole revolution.
 
@@ -444,8 +480,7 @@ class Problem:
         rear, die = self.comm.allreduce(rear), self.comm.allreduce(die)
         if self.case.die == "rigid":
             R = self.contact_forces(self.gather(x))
-            first = 2 * len(self._live)
-            die = float(R[first + 1 : 2 * self._n_nodes : 2].sum())
+            die = float(R[self.z_on_rigid_die].sum())
         return rear, die
 
     def energy(self, x: PETSc.Vec) -> float:
@@ -483,20 +518,6 @@ class Problem:
         found = {name: value for part in self.comm.allgather(mine) for name, value in part.items()}
         return {name: found[name] for name in points}
 
-    def point_gaps(self, x: PETSc.Vec) -> dict[str, float]:
-        """Gap at the billet's corners K, L, M as the first zone that holds them measures it, mm."""
-        z = self.gather(x)
-        corners = self.case.profile.points
-        out: dict[str, float] = {}
-        for term in self.terms:
-            nodes, gaps = gap_at_nodes(term.pair, z)
-            positions = _node_positions(term.pair.slave, nodes)
-            for name in ("K", "L", "M"):
-                near = np.linalg.norm(positions - corners[name], axis=1) < 1e-6 * self.case.profile.radius
-                if near.any() and name not in out:
-                    out[name] = float(gaps[near][0])
-        return out
-
     def worst(self, x: PETSc.Vec) -> str:
         """Where the residual is largest: zone and current place, in words."""
         f = x.duplicate()
@@ -509,9 +530,7 @@ class Problem:
         if rank == self.comm.rank:
             block = at // 2
             place = self.V.tabulate_dof_coordinates()[block, :2] + x.array_r[2 * block : 2 * block + 2]
-            node = np.searchsorted(self._live, block + self._first_dof // 2)
-            zones = [t.pair.name for t in self.terms if node in t.pair.slave.nodes or node in t.pair.die.nodes]
-            where = f"zone {' and '.join(zones)}" if zones else "away from the zones"
+            where = self.zones_of(int(np.searchsorted(self._live, block + self._first_dof // 2)))
             text = f"{where}, (r, y) = ({place[0]:.3f}, {place[1]:.3f}) mm, out of balance by {largest:.3g} N"
         return str(self.comm.bcast(text, root=rank))
 
@@ -613,8 +632,3 @@ def _sorted_distinct(keys: Index) -> Index:
 def _subdivide(curve: Array, parts: list[int]) -> Array:
     pieces = [a + (b - a) * np.arange(n)[:, None] / n for a, b, n in zip(curve[:-1], curve[1:], parts, strict=True)]
     return np.vstack([*pieces, curve[-1:]])
-
-
-def _node_positions(surface: Surface, nodes: Index) -> Array:
-    number, first = np.unique(surface.nodes, return_index=True)
-    return np.asarray(surface.X.reshape(-1, 2)[first[np.searchsorted(number, nodes)]])

@@ -16,7 +16,7 @@ import numpy as np
 
 from extrusion.errors import StepError
 from extrusion.newton import Newton
-from extrusion.problem import Problem
+from extrusion.system import System
 from extrusion.zones import ContactState
 
 log = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ class Step:
     x: PETSc.Vec = field(repr=False, compare=False)  # live: copy what must outlast the step
 
 
-def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step]:
+def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]:
     """Drive the billet through the times (mm), yielding accepted steps.
 
     Raises:
@@ -124,7 +124,7 @@ def steps(problem: Problem, newton: Newton, times: list[float]) -> Iterator[Step
         caught = dict.fromkeys(caught, 0.0)
 
 
-def _caught(problem: Problem, t: float) -> dict[str, float]:
+def _caught(problem: System, t: float) -> dict[str, float]:
     """What each bilateral zone has just taken hold of, with a warning where that was far from the die."""
     out = {term.pair.name: term.caught for term in problem.terms if term.pair.closure == "bilateral"}
     for zone, distance in out.items():
@@ -143,7 +143,7 @@ class _Attempt:
     remedy: str = "Try another --increment, a finer mesh, or --method nitsche or mortar on P2"
 
 
-def _increment(problem: Problem, newton: Newton, accepted: PETSc.Vec) -> _Attempt:
+def _increment(problem: System, newton: Newton, accepted: PETSc.Vec) -> _Attempt:
     """Solve one predicted increment in place; with frozen pairing, by geometry passes (two at least, as the sheet).
 
     Without, once is enough, unless a mortar row that is just leaving the die flips between held and let go: then these

@@ -71,6 +71,7 @@ class ContactTerm(Protocol):
 
     pair: Pair
     multipliers: int
+    forced: Index  # displacements (and pressures) in z that the term can put a force on, in order along slave and die
     caught: float  # mm: how far from the die the farthest point was that the last `start` or `accept` closed for good
 
     def start(self, z: Array) -> None:
@@ -124,6 +125,7 @@ class NodalContact:
         self.X = polyline_points(slave)
         self.weight = nodal_weights(slave, pair.axisymmetric)
         self.multipliers = 0 if pair.closure == "check" else len(self.nodes)
+        self.forced = _forced(pair)
         self.at = first + np.arange(self.multipliers)
         self._kappa = np.full(len(self.nodes), float(np.mean(stiffness) * np.mean(np.abs(self.weight))))
         self._radius, self._interpenetrating = radius, interpenetrating
@@ -240,6 +242,7 @@ class IntegratedContact:
         order: int = 4,
     ) -> None:
         self.pair, self._k, self._material, self._theta = pair, stiffness, material, theta
+        self.forced = _forced(pair, behind=bool(theta) and material is not None)
         self._radius, self._interpenetrating, self._order = radius, interpenetrating, order
         self.closed, self.caught = np.zeros(len(pair.slave.nodes), dtype=bool), 0.0
 
@@ -430,6 +433,7 @@ class MortarContact:
         order: int = 4,
     ) -> None:
         self.pair, self._order = pair, order
+        self.forced = _forced(pair)
         m = len(pair.slave.nodes)
         facets = np.broadcast_to(stiffness, m)
         self._k = 0.5 * (np.append(facets[:1], facets) + np.append(facets, facets[-1:]))  # at the vertices
@@ -657,6 +661,17 @@ def _even(z: Array) -> Array:
 
 def _displacement(z: Array, nodes: Index) -> Array:
     return np.stack([z[2 * nodes], z[2 * nodes + 1]], axis=-1)
+
+
+def _forced(pair: Pair, behind: bool = False) -> Index:
+    """Entries of z that forces at the slave's facets (or in the cells behind them) and at the die's go to."""
+    if pair.closure == "check":
+        return np.zeros(0, dtype=np.int64)
+    nodes = np.concatenate([(pair.slave.cell_nodes if behind else pair.slave.nodes).ravel(), pair.die.nodes.ravel()])
+    entries = (2 * nodes[:, None] + np.arange(2)).ravel()
+    if behind and pair.slave.pressure_cols is not None:
+        entries = np.concatenate([entries, pair.slave.pressure_cols.ravel()])
+    return entries[np.sort(np.unique(entries, return_index=True)[1])]
 
 
 def _none() -> Triplets:

@@ -41,7 +41,7 @@ def test_tangent_by_central_differences(method: str, form: str, die: str) -> Non
     case = replace(problems()["unilateral"], method=method, form=form, die=die, size=4.0)
     problem = solved(case, [20.0, 70.0])
     rng = np.random.default_rng(1)
-    free = problem._z_to_x >= 0
+    free = problem.z_to_x >= 0
     z = problem.gather(problem.x)
     z[free] += 1e-3 * rng.standard_normal(free.sum())
     direction = np.where(free, rng.standard_normal(z.shape), 0.0)

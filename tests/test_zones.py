@@ -230,7 +230,7 @@ def scene(
     for term in problem.terms:
         term.pair_up(z)
         term.closed = rng.random(len(term.closed)) < 0.3
-    return problem.terms, z, problem._z_to_x >= 0
+    return problem.terms, z, problem.z_to_x >= 0
 
 
 @pytest.mark.parametrize("t", [22.0, 143.0])

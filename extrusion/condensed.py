@@ -1,0 +1,569 @@
+"""A problem condensed to the forces of contact: the bulk is factored once, and Newton's method runs on the surface.
+
+The bulk is linear. With E the entries that contact can put forces f on, the displacements are::
+
+    u = t d - K^-1 E^T f        t: displacement of the rear face, d: the billet moved as a whole by 1
+
+so what contact reads of them is ``u_c = t d_c - C f`` with the compliance C, a dense matrix of which one column is one
+solve with the factor of K. The unknown is x = (t, f, multipliers) and the residual, in newtons, is::
+
+    R(z) - f        R: contact's forces at the contact vector z = (u_c, multipliers)
+
+It equals the residual of the full problem with all of its other dofs in balance, and so do Newton's iterates. Columns
+of C are made when a force first needs them. Everything dense is on rank 0; the factor is shared by all ranks.
+"""
+
+from __future__ import annotations
+
+import logging
+import weakref
+from dataclasses import dataclass
+from typing import Any
+
+from mpi4py import MPI  # noqa: F401  (the wheel wants it first)
+from petsc4py import PETSc
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+
+from extrusion.gap import Array, Index
+from extrusion.problem import Problem
+from extrusion.system import System, node_positions
+
+log = logging.getLogger(__name__)
+
+BLOCK = 128
+"""Right-hand sides that are solved for together."""
+
+MARGIN = 32
+"""Forces along the surface, to both sides of those that are needed, that are made ready with them."""
+
+
+class Condensed(System):
+    """Contact forces as the unknowns of a problem.
+
+    Args:
+        problem: The scene. Its own x is only used by `recover`.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.full = problem
+        self.case, self.comm, self.terms = problem.case, problem.comm, problem.terms
+        self.n_z, self.n_multipliers = problem.n_z, problem.n_multipliers
+        self.on_root = self.comm.rank == 0
+        self._number()
+        self._factor()
+        size = 1 + self.n_forces + self.n_multipliers
+        self.x = PETSc.Vec().createMPI((size if self.on_root else 0, size), comm=self.comm)
+        self._tangent = _Tangent(self)
+        self._known: list[tuple[Array, Array]] = []
+        self._last = np.zeros(0), np.zeros(0)
+        n = self.x.local_size
+        self._A = PETSc.Mat().createPython(((n, size), (n, size)), context=self._tangent, comm=self.comm)
+        self._A.setUp()
+
+    def _number(self) -> None:
+        """What contact reads (rows of C, body by body), what it puts forces on (columns), and where both are in z."""
+        full = self.full
+        first = self.n_z - self.n_multipliers
+        free = full.z_free[:first]
+        read = np.flatnonzero(free)
+        n_u = 2 * len(full.z_in_billet)
+        in_billet = np.ones(first, dtype=bool)  # the pressures are the billet's
+        in_billet[:n_u] = np.repeat(full.z_in_billet, 2)
+        self._watch = full.named_points()
+        places = full.places_of(self._watch)  # name -> the two global entries of the full x
+        dofs, bodies = full.z_to_x[read], in_billet[read]
+        free_of_held = ~np.isin([*places.values()], full.held).reshape(-1, 2)
+        watched = np.array([*places.values()], dtype=np.int64).reshape(-1, 2)
+        more = np.setdiff1d(watched[free_of_held], dofs)
+        of_billet = {dof for name, pair in places.items() if name in ("K", "L", "M", "N") for dof in pair}
+        bodies = np.concatenate([bodies, np.isin(more, [*of_billet])])
+        z_of = np.concatenate([read, np.full(len(more), -1)])
+        dofs = np.concatenate([dofs, more])
+        order = np.argsort(~bodies, kind="stable")
+        self.dofs, z_of, bodies = dofs[order], z_of[order], bodies[order]
+        self.bodies = [slice(0, int(bodies.sum())), slice(int(bodies.sum()), len(bodies))]
+        self.n_read = len(self.dofs)
+        self._in_z = np.flatnonzero(z_of >= 0)  # rows that stand in z, and where
+        self._z_of = z_of[self._in_z]
+        self._row_of_z = np.full(self.n_z, -1)
+        self._row_of_z[self._z_of] = self._in_z
+        self._row_of_z[first:] = self.n_read + np.arange(self.n_multipliers)
+        self._watched = np.where(np.isin(watched, self.dofs), _place_in(self.dofs, watched), -1)
+        self._watched_drive = full.drive_at(watched)
+        self._points = [*places]
+
+        forced = np.concatenate([term.forced for term in self.terms])
+        forced = forced[np.sort(np.unique(forced, return_index=True)[1])]
+        self.z_forced = forced[full.z_free[forced]]
+        self.n_forces = len(self.z_forced)
+        self._force_of_z = np.full(self.n_z, -1)
+        self._force_of_z[self.z_forced] = np.arange(self.n_forces)
+        self._force_of_z[first:] = self.n_forces + np.arange(self.n_multipliers)
+        self.force_body = np.where(in_billet[self.z_forced], 0, 1)
+        self._force_dofs = full.z_to_x[self.z_forced]
+        self._z_drive = np.zeros(self.n_z)  # d at the entries of z
+        self._z_y = [np.zeros(self.n_z, dtype=bool) for _ in range(2)]  # axial entries of billet and die
+        y = np.zeros(first, dtype=bool)
+        y[1:n_u:2] = True
+        self._z_y[0][:first] = y & in_billet
+        self._z_y[1][:first] = y & ~in_billet
+        self._z_drive[self._z_y[0]] = 1.0
+
+    # -- bulk ------------------------------------------------------------------------------------------------
+
+    def _factor(self) -> None:
+        pc = PETSc.PC().create(self.comm)
+        pc.setType("cholesky")
+        pc.setFactorSolverType("mumps")
+        pc.setOperators(self.full.bulk())
+        pc.setUp()
+        self._pc, self._F = pc, pc.getFactorMatrix()
+        self._drive_norm = self.full.size_of_drive()
+        # the compliance of each body, of which columns are made on demand
+        self.C = [np.zeros((body.stop - body.start, 0)) for body in self.bodies]
+        self.column = np.full(self.n_forces, -1)  # of each force, in its body's C
+        self._forces: list[Index] = [np.zeros(0, dtype=np.int64) for _ in self.bodies]  # of each column
+
+    @property
+    def right_hand_sides(self) -> int:
+        """Columns of the compliance made so far."""
+        return sum(len(forces) for forces in self._forces)
+
+    def provide(self, wanted: Index) -> None:
+        """Make the columns of C for some forces (given on rank 0), and for those beside them. Collective."""
+        missing = wanted[self.column[wanted] < 0] if self.on_root else wanted
+        if self.comm.size > 1:
+            missing = self.comm.bcast(missing if len(missing) else None)
+        if missing is None or not len(missing):
+            return
+        near = np.zeros(self.n_forces, dtype=bool)
+        near[missing] = True
+        reach = np.convolve(near, np.ones(2 * MARGIN + 1), "same") > 0
+        have = np.zeros(self.n_forces, dtype=bool)
+        have[np.concatenate(self._forces)] = True
+        for body in (0, 1):
+            new = np.flatnonzero(reach & ~have & (self.force_body == body))
+            parts = [self._solve(new[i : i + BLOCK], body) for i in range(0, len(new), BLOCK)]
+            if self.on_root:
+                self.C[body] = np.concatenate([self.C[body], *parts], axis=1)
+            self.column[new] = len(self._forces[body]) + np.arange(len(new))
+            self._forces[body] = np.concatenate([self._forces[body], new])
+
+    def _solve(self, forces: Index, body: int) -> Array:
+        """Rows of one body in K^-1 E^T for some forces on it; on rank 0."""
+        n, n_local, row0 = self.full.bulk_size
+        size = len(forces)
+        at = self._force_dofs[forces]
+        X = PETSc.Mat().createDense(((n_local, n), (None, size)), comm=self.comm)
+        X.setUp()
+        if self.comm.size == 1:  # sparse right-hand sides cost half, but MUMPS wants them on one rank
+            ones = np.ones(size)
+            csr = np.arange(size + 1, dtype=PETSc.IntType), at.astype(PETSc.IntType), ones
+            rows = PETSc.Mat().createAIJ((size, n), csr=csr, comm=self.comm)
+            B = PETSc.Mat().createTranspose(rows)
+        else:
+            B = X.duplicate()
+            mine = (at >= row0) & (at < row0 + n_local)
+            B.getDenseArray()[at[mine] - row0, np.flatnonzero(mine)] = 1.0
+            B.assemble()
+        X.assemble()
+        self._F.matSolve(B, X)
+        rows_of = self.dofs[self.bodies[body]]
+        mine = np.flatnonzero((rows_of >= row0) & (rows_of < row0 + n_local))
+        values = X.getDenseArray()[rows_of[mine] - row0]
+        B.destroy()
+        X.destroy()
+        if self.comm.size == 1:
+            return np.asarray(values)
+        parts = self.comm.gather((mine, values))
+        out = np.zeros((len(rows_of), size))
+        for where, part in parts or ():
+            out[where] = part
+        return out
+
+    def _displacements(self, f: Array) -> Array:
+        """-C f at all rows."""
+        out = np.zeros(self.n_read)
+        for body, C, forces in zip(self.bodies, self.C, self._forces, strict=True):
+            if len(forces):
+                out[body] = -(C @ f[forces])
+        return out
+
+    # -- unknowns --------------------------------------------------------------------------------------------
+
+    def _split(self, x: PETSc.Vec) -> tuple[float, Array, Array]:
+        values = x.array_r
+        return float(values[0]), values[1 : 1 + self.n_forces], values[1 + self.n_forces :]
+
+    def _z(self, x: PETSc.Vec) -> Array:
+        """The contact vector; on rank 0. The last two are remembered."""
+        for known, z in self._known:
+            if np.array_equal(known, x.array_r):
+                return z
+        t, f, multipliers = self._split(x)
+        z = t * self._z_drive
+        z[self._z_of] += self._displacements(f)[self._in_z]
+        z[self.n_z - self.n_multipliers :] = multipliers
+        self._known = [(np.array(x.array_r), z), *self._known[:1]]
+        return z
+
+    def gather(self, x: PETSc.Vec) -> Array:
+        z = self._z(x) if self.on_root else np.zeros(0)
+        return self.comm.bcast(z) if self.comm.size > 1 else z
+
+    def drive(self, x: PETSc.Vec, t: float) -> None:
+        x.array[:1] = t
+
+    def shift_billet(self, x: PETSc.Vec, dt: float) -> None:
+        x.array[:1] += dt
+
+    def largest_displacement(self, x: PETSc.Vec) -> float:
+        largest = 0.0
+        if self.on_root:
+            t, f, _ = self._split(x)
+            largest = float(np.max(np.abs(t * self._z_drive[self._z_of] + self._displacements(f)[self._in_z])))
+        return self.comm.bcast(largest) if self.comm.size > 1 else largest
+
+    def recover(self, x: PETSc.Vec) -> PETSc.Vec:
+        full = self.full
+        values = np.array(x.array_r)
+        if self.comm.size > 1:
+            values = self.comm.bcast(values)
+        b = self._pc.getOperators()[0].createVecRight()
+        u = b.duplicate()
+        _, _, row0 = full.bulk_size
+        mine = (self._force_dofs >= row0) & (self._force_dofs < row0 + b.local_size)
+        b.array[self._force_dofs[mine] - row0] = -values[1 : 1 + self.n_forces][mine]
+        self._pc.apply(b, u)
+        full.set_displacements(u, values[0], values[1 + self.n_forces :])
+        b.destroy()
+        u.destroy()
+        return full.x
+
+    # -- equations -------------------------------------------------------------------------------------------
+
+    def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        out = f.array  # on every rank: PETSc counts changes, and forgets the norm
+        if not self.on_root:
+            return
+        try:
+            out[1:] = self._out_of_balance(x, self._z(x))
+            out[0] = 0.0
+        except ArithmeticError:
+            out[:] = np.nan
+
+    def _out_of_balance(self, x: PETSc.Vec, z: Array) -> Array:
+        """The residual's rows of forces and multipliers; on rank 0. The last one is remembered."""
+        if self._last[0] is not z:
+            R = self.contact_forces(z)
+            self._last = z, np.concatenate([R[self.z_forced], R[self.n_z - self.n_multipliers :]])
+        out = self._last[1].copy()
+        out[: self.n_forces] -= x.array_r[1 : 1 + self.n_forces]
+        return out
+
+    def tangent(self, x: PETSc.Vec, geometric: bool) -> PETSc.Mat:
+        D, F = None, np.zeros(0)
+        if self.on_root:
+            z = self._z(x)
+            F = self._out_of_balance(x, z)
+            parts = [term.tangent(z, geometric) for term in self.terms]
+            rows, cols, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+            rows, cols = self._force_of_z[rows], self._row_of_z[cols]
+            keep = (rows >= 0) & (cols >= 0) & (values != 0.0)
+            D = _Derivative(rows[keep], cols[keep], values[keep])
+        self._tangent.set(D, F)
+        return self._A
+
+    def forget_pattern(self) -> None:
+        self._tangent.forget()
+
+    def set_solver(self, ksp: PETSc.KSP) -> None:
+        """Flexible GMRES, preconditioned by a dense factorisation over the forces that act."""
+        ksp.setType("fgmres")
+        ksp.setGMRESRestart(self._tangent.STALE)  # where it is factored anew it starts from the residual
+        ksp.setTolerances(rtol=1e-9, atol=1e-50, max_it=60)
+        pc = ksp.getPC()
+        pc.setType("python")
+        pc.setPythonContext(self._tangent)
+
+    def tangent_without_contact(self) -> PETSc.Mat:
+        return self._A
+
+    def round_off(self, x: PETSc.Vec) -> float:
+        """That of the full problem, so that both stop alike; here nothing cancels in the bulk."""
+        return self.full.round_off_at(self._drive_norm * abs(self._time(x)))
+
+    def _time(self, x: PETSc.Vec) -> float:
+        """The displacement of the rear face that x holds, on every rank."""
+        t = float(x.array_r[0]) if self.on_root else 0.0
+        return self.comm.bcast(t) if self.comm.size > 1 else t
+
+    def start(self, x: PETSc.Vec) -> None:
+        super().start(x)
+        self._last = np.zeros(0), np.zeros(0)
+
+    def pair_up(self, x: PETSc.Vec, settle: bool = False) -> None:
+        super().pair_up(x, settle)
+        self._last = np.zeros(0), np.zeros(0)
+
+    def accept(self, x: PETSc.Vec) -> None:
+        super().accept(x)
+        self._last = np.zeros(0), np.zeros(0)
+
+    # -- reports ---------------------------------------------------------------------------------------------
+
+    def reactions(self, x: PETSc.Vec) -> tuple[float, float]:
+        R = self.contact_forces(self.gather(x))
+        die = self._z_y[1] if self.case.die == "elastic" else self.full.z_on_rigid_die
+        return float(R[self._z_y[0]].sum()), float(R[die].sum())
+
+    def energy(self, x: PETSc.Vec) -> float:
+        # half of the supports' work less that of the forces on the rest, which are -R
+        z = self.gather(x)
+        R = self.contact_forces(z)
+        free = self.full.z_free.copy()
+        free[self.n_z - self.n_multipliers :] = False
+        at_rear = R[self._z_y[0] & free].sum()  # K u there
+        return 0.5 * float(self._time(x) * at_rear - z[free] @ R[free])
+
+    def named_points(self) -> dict[str, tuple[int, int]]:
+        return self._watch
+
+    def point_displacements(self, x: PETSc.Vec, points: dict[str, tuple[int, int]]) -> dict[str, tuple[float, float]]:
+        found = None
+        if self.on_root:
+            t, f, _ = self._split(x)
+            u = np.append(self._displacements(f), 0.0)
+            values = t * self._watched_drive + u[self._watched]
+            found = {name: (float(r), float(y)) for name, (r, y) in zip(self._points, values, strict=True)}
+        found = self.comm.bcast(found) if self.comm.size > 1 else found
+        assert found is not None
+        return {name: found[name] for name in points}
+
+    def worst(self, x: PETSc.Vec) -> str:
+        f = x.duplicate()
+        self.residual(x, f)
+        text = ""
+        if self.on_root:
+            size = np.nan_to_num(np.abs(f.array_r[1 : 1 + self.n_forces]), nan=np.inf)
+            at = int(np.argmax(size)) if len(size) else 0
+            node = int(self.z_forced[at]) // 2
+            place = "?"
+            for term in self.terms:
+                for surface in (term.pair.slave, term.pair.die):
+                    if node in surface.nodes:
+                        position = node_positions(surface, np.array([node]))[0] + self._z(x)[2 * node : 2 * node + 2]
+                        place = f"({position[0]:.3f}, {position[1]:.3f})"
+            text = f"{self.zones_of(node)}, (r, y) = {place} mm, out of balance by {size[at]:.3g} N"
+        f.destroy()
+        return str(self.comm.bcast(text))
+
+
+@dataclass(frozen=True)
+class _Derivative:
+    """Triplets of contact forces and multiplier rows by displacements read and multipliers."""
+
+    rows: Index
+    cols: Index
+    values: Array
+
+
+class _Tangent:
+    """``-1 - D C`` over the forces, and D's columns of the multipliers: PETSc's matrix of it, and a preconditioner.
+
+    D is the derivative of contact's forces by what they read. Without friction the force on a node acts along a
+    normal that hardly turns, so its two rows of D are nearly parallel, and the preconditioner takes one unknown w for
+    both: with D = E D_B, and E as wide as the rows B that are kept, ``f = E w - F`` and::
+
+        (1 + D_B C E) w - D_B,p p = D_B C F        p: the multipliers, whose rows stay as they are
+
+    is solved by a dense factorisation. Rows that are not parallel (at the die's corners, at the billet's edge) are all
+    kept. The factorisation serves until the Krylov method, for which the change of D is small, takes too long with it.
+    """
+
+    PARALLEL = 0.1
+    """Part of a row that may stand out of its neighbour's direction."""
+
+    STALE = 12
+    """Krylov iterations after which a factorisation of an earlier tangent is made anew."""
+
+    def __init__(self, system: Condensed) -> None:
+        self._system = weakref.proxy(system)  # PETSc holds this object in C
+        self._forces = np.zeros(0, dtype=np.int64)  # in the order of the rows that follow
+        self._pressures = np.zeros(0, dtype=np.int64)
+        self._read = [np.zeros(0, dtype=np.int64) for _ in range(2)]  # rows of each body's C that D reads
+        self._applied = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Factor the next tangent anew."""
+        self._lu: Any = None
+
+    def set(self, D: _Derivative | None, F: Array) -> None:
+        """Take a derivative and the residual it belongs to (on rank 0). Collective."""
+        system = self._system
+        n_f = system.n_forces
+        involved = np.zeros(0, dtype=np.int64)
+        if D is not None:
+            own = (D.rows >= n_f) & (D.cols - system.n_read == D.rows - n_f)  # multipliers on their own rows
+            self._diagonal = np.full(n_f + system.n_multipliers, -1.0)
+            self._diagonal[n_f:] = np.bincount(D.rows[own] - n_f, D.values[own], system.n_multipliers)
+            active = np.bincount(D.rows[~own], minlength=len(self._diagonal)) > 0
+            active[n_f + D.cols[~own & (D.cols >= system.n_read)] - system.n_read] = True
+            involved = np.flatnonzero(active[:n_f] | (F[:n_f] != 0.0))
+        system.provide(involved)
+        if D is None:
+            return
+        self._take(D, involved, n_f + np.flatnonzero(active[n_f:] | (self._diagonal[n_f:] == 0.0)))
+        self._fresh = self._lu is None
+        if self._lu is None:
+            self._factor(self.PARALLEL)
+        self._applied = 0
+
+    def _take(self, D: _Derivative, forces: Index, pressures: Index) -> None:
+        """D over the forces, pressures and displacements involved; C over them too, if they have not been before."""
+        system = self._system
+        n_f, n_read = system.n_forces, system.n_read
+        read = np.zeros(n_read, dtype=bool)
+        read[D.cols[D.cols < n_read]] = True
+        known = [
+            np.isin(np.flatnonzero(read[span]), rows) for span, rows in zip(system.bodies, self._read, strict=True)
+        ]
+        if not (
+            self._lu is not None
+            and np.isin(forces, self._forces).all()
+            and np.isin(pressures, self._pressures).all()
+            and all(k.all() for k in known)
+        ):
+            if self._lu is not None:  # in the same increment: what has been involved may be so again
+                forces, pressures = np.union1d(forces, self._forces), np.union1d(pressures, self._pressures)
+                for span, rows in zip(system.bodies, self._read, strict=True):
+                    read[span.start + rows] = True
+            self.forget()
+            self._forces, self._pressures = forces, pressures
+            self._read = [np.flatnonzero(read[span]) for span in system.bodies]
+            self._columns = [np.flatnonzero(system.force_body[forces] == body) for body in range(2)]
+            self._C = [
+                C[np.ix_(rows, system.column[forces[columns]])]
+                for C, rows, columns in zip(system.C, self._read, self._columns, strict=True)
+            ]
+        n_rows = len(self._forces) + len(self._pressures)
+        row = np.full(n_f + system.n_multipliers, -1)
+        row[self._forces] = np.arange(len(self._forces))
+        row[self._pressures] = len(self._forces) + np.arange(len(self._pressures))
+        col = np.full(n_read + system.n_multipliers, -1)
+        first = 0
+        for span, rows in zip(system.bodies, self._read, strict=True):
+            col[span.start + rows] = first + np.arange(len(rows))
+            first += len(rows)
+        col[n_read - n_f + self._pressures] = first + np.arange(len(self._pressures))
+        r, c = row[D.rows], col[D.cols]
+        on = (r >= 0) & (c >= 0)
+        shape = n_rows, first + len(self._pressures)
+        self._D = scipy.sparse.coo_array((D.values[on], (r[on], c[on])), shape=shape).tocsr()
+
+    def _factor(self, parallel: float) -> None:
+        lead, follower, slope = self._leaders(parallel)
+        n, m, n_f = len(lead), len(self._pressures), len(self._forces)
+        self._kept = np.concatenate([lead, n_f + np.arange(m)])
+        two = np.flatnonzero(follower >= 0)
+        self._two, self._follower, self._slope = two, follower[two], slope[two]
+        self._lead = lead
+        self._D_kept = D = self._D[self._kept]
+        M = np.zeros((n + m, n + m))
+        first = 0
+        of_lead = self._system.force_body[self._forces[lead]]
+        for body, (C, columns) in enumerate(zip(self._C, self._columns, strict=True)):
+            place = np.full(n_f, -1)
+            place[columns] = np.arange(len(columns))
+            mine = np.flatnonzero(of_lead == body)
+            C_E = C[:, place[lead[mine]]]
+            with_two = np.flatnonzero(follower[mine] >= 0)
+            C_E[:, with_two] += slope[mine[with_two]] * C[:, place[follower[mine[with_two]]]]
+            M[:, mine] = D[:, first : first + len(C)] @ C_E
+            first += len(C)
+        M[n:, :n] *= -1.0
+        M[np.arange(n), np.arange(n)] += 1.0
+        pressed = D[:, first:].toarray()
+        M[:n, n:] = -pressed[:n]
+        M[n:, n:] = pressed[n:]
+        self._lu = scipy.linalg.lu_factor(M.T, overwrite_a=True, check_finite=False) if n + m else ()
+
+    def _leaders(self, parallel: float) -> tuple[Index, Index, Array]:
+        """Forces that are kept; which one goes with each of them (or -1), and in what proportion."""
+        system, n_f = self._system, len(self._forces)
+        D = self._D[:n_f].copy()
+        of_pressure = D.indices >= D.shape[1] - len(self._pressures)
+        if of_pressure.any() and self._D[n_f:].nnz:  # by pressures as by displacements, each times a stiffness
+            D.data[of_pressure] *= np.max(np.abs(self._D[n_f:].data)) / np.max(np.abs(D.data[of_pressure]))
+        z = system.z_forced[self._forces]
+        order = np.argsort(z)
+        near = order[np.minimum(np.searchsorted(z, z ^ 1, sorter=order), n_f - 1)]
+        other = np.where(z[near] == z ^ 1, near, -1) if n_f else near
+        square: Array = D.multiply(D).sum(axis=1)
+        acts = square > 0.0
+        partner = np.where(other >= 0, square[other], 0.0)
+        first = np.flatnonzero(acts & (other >= 0) & ((square > partner) | ((square == partner) & (z % 2 == 0))))
+        second = other[first]
+        slope = D[first].multiply(D[second]).sum(axis=1) / square[first]
+        goes = square[second] - slope**2 * square[first] <= np.copysign(parallel**2, parallel) * square[first]
+        follower, ratio = np.full(n_f, -1), np.zeros(n_f)
+        follower[first[goes]] = second[goes]
+        ratio[first[goes]] = slope[goes]
+        acts[second[goes]] = False
+        lead = np.flatnonzero(acts)
+        return lead, follower[lead], ratio[lead]
+
+    def _image(self, D: Any, f: Array, p: Array) -> Array:
+        """Rows of D by the displacements of some forces, and by pressures."""
+        u = [C @ f[columns] for C, columns in zip(self._C, self._columns, strict=True)]
+        return np.asarray(D @ np.concatenate([-u[0], -u[1], p]))
+
+    def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """The tangent by a vector whose forces are among those involved."""
+        into = y.array
+        if not self._system.on_root:
+            return
+        v = x.array_r[1:]
+        f = v[self._forces]
+        image = self._image(self._D, f, v[self._pressures])
+        into[0] = x.array_r[0]
+        into[1:] = self._diagonal * v
+        into[1 + self._forces] = image[: len(f)] - f
+        into[1 + self._pressures] = image[len(f) :]
+
+    def apply(self, pc: PETSc.PC, b: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Solve nearly."""
+        into = y.array
+        if not self._system.on_root:
+            return
+        self._applied += 1
+        if self._applied > self.STALE and not self._fresh:
+            self._factor(self.PARALLEL)
+            self._fresh = True
+        if self._applied == 4 * self.STALE + 1:
+            self._factor(-1.0)
+        F = b.array_r[1:]
+        out = F / np.where(self._diagonal != 0.0, self._diagonal, 1.0)
+        if self._lu:
+            f, p = F[self._forces], F[self._pressures]
+            n = len(self._lead)
+            rhs = -self._image(self._D_kept, f, np.zeros(len(p)))
+            rhs[n:] = p - rhs[n:]
+            w = scipy.linalg.lu_solve(self._lu, rhs, trans=1, check_finite=False)
+            u = -f
+            u[self._lead] += w[:n]
+            u[self._follower] += self._slope * w[self._two]
+            out[self._forces] = u
+            out[self._pressures] = w[n:]
+        into[0] = b.array_r[0]
+        into[1:] = out
+
+
+def _place_in(values: Index, wanted: Index) -> Index:
+    """Where each wanted value stands in unsorted values that hold it (elsewhere anything)."""
+    order = np.argsort(values)
+    return np.asarray(order[np.minimum(np.searchsorted(values, wanted, sorter=order), len(values) - 1)])

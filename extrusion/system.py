@@ -1,0 +1,163 @@
+"""What load stepping and Newton's method ask of a scene, in whichever unknowns it is solved."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+
+from extrusion.cases import Case
+from extrusion.gap import Array, Index, Surface
+from extrusion.zones import ContactTerm, MortarContact, gap_at_nodes
+
+
+class System(ABC):
+    """Two bodies and their contact zones; the unknown x is a vector of which every system has its own kind.
+
+    All methods are collective. The contact vector z (displacements of all nodes that contact can touch, pressures
+    and multipliers there) is the same for all systems.
+    """
+
+    case: Case
+    comm: MPI.Intracomm
+    terms: list[ContactTerm]
+    x: PETSc.Vec
+    n_z: int
+    n_multipliers: int
+
+    # -- unknowns --------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def gather(self, x: PETSc.Vec) -> Array:
+        """The contact vector z of x, on every rank."""
+
+    @abstractmethod
+    def drive(self, x: PETSc.Vec, t: float) -> None:
+        """Set the supports' values at rear displacement t, mm."""
+
+    @abstractmethod
+    def shift_billet(self, x: PETSc.Vec, dt: float) -> None:
+        """Move the whole billet along y by dt, mm."""
+
+    @abstractmethod
+    def largest_displacement(self, x: PETSc.Vec) -> float:
+        """Largest displacement component in x on any rank, multipliers left out."""
+
+    @abstractmethod
+    def recover(self, x: PETSc.Vec) -> PETSc.Vec:
+        """All displacements of both bodies (as `Problem.x` holds them)."""
+
+    # -- equations -------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        """Residual into f, N; NaN where the surfaces have lost each other."""
+
+    @abstractmethod
+    def tangent(self, x: PETSc.Vec, geometric: bool) -> PETSc.Mat:
+        """Derivative of the residual; ``geometric`` adds the second variation of the gap."""
+
+    @abstractmethod
+    def set_solver(self, ksp: PETSc.KSP) -> None:
+        """Say how the tangent's linear systems are solved."""
+
+    @abstractmethod
+    def tangent_without_contact(self) -> PETSc.Mat:
+        """A matrix of the tangent's kind, before there is a tangent."""
+
+    def forget_pattern(self) -> None:  # noqa: B027
+        """Let go of the contact pairs met so far, if they cost anything."""
+
+    @abstractmethod
+    def round_off(self, x: PETSc.Vec) -> float:
+        """Norm of the round-off in the residual at x, N."""
+
+    def contact_forces(self, z: Array) -> Array:
+        """Contact's part of the residual over z, N (and multiplier rows)."""
+        R = np.zeros(self.n_z)
+        for term in self.terms:
+            term.add_residual(z, R)
+        return R
+
+    # -- contact state ---------------------------------------------------------------------------------------
+
+    def start(self, x: PETSc.Vec) -> None:
+        """Accepted contact state at t = 0."""
+        z = self.gather(x)
+        for term in self.terms:
+            term.start(z)
+
+    def pair_up(self, x: PETSc.Vec, settle: bool = False) -> None:
+        """Pair billet and die anew at x, for terms that freeze their pairing."""
+        z = self.gather(x)
+        for term in self.terms:
+            term.pair_up(z, settle)
+
+    @property
+    def may_settle(self) -> bool:
+        """Whether a solve that failed is worth another try with `pair_up` settling what may have flipped in it."""
+        return any(isinstance(term, MortarContact) and not term.pair.extended for term in self.terms)
+
+    def settled(self, x: PETSc.Vec) -> bool:
+        """Whether what zones settled in `pair_up` still holds at x."""
+        z = self.gather(x)
+        return all(term.settled(z) for term in self.terms)
+
+    def accept(self, x: PETSc.Vec) -> None:
+        """Make x the accepted state of every zone."""
+        z = self.gather(x)
+        for term in self.terms:
+            term.accept(z)
+
+    # -- reports ---------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def reactions(self, x: PETSc.Vec) -> tuple[float, float]:
+        """Axial force of the rear face on the billet, and of the die's supports on the die, N, whole revolution.
+
+        Both are positive in +y; they balance. A rigid die is its own support.
+        """
+
+    @abstractmethod
+    def energy(self, x: PETSc.Vec) -> float:
+        """Elastic energy of both bodies, N mm, whole revolution."""
+
+    @abstractmethod
+    def named_points(self) -> dict[str, tuple[int, int]]:
+        """Where `point_displacements` finds each named point of the profile that is a node of the mesh."""
+
+    @abstractmethod
+    def point_displacements(self, x: PETSc.Vec, points: dict[str, tuple[int, int]]) -> dict[str, tuple[float, float]]:
+        """Displacement (u_r, u_y) of named points, mm."""
+
+    @abstractmethod
+    def worst(self, x: PETSc.Vec) -> str:
+        """Where the residual is largest: zone and current place, in words."""
+
+    def point_gaps(self, x: PETSc.Vec) -> dict[str, float]:
+        """Gap at the billet's corners K, L, M as the first zone that holds them measures it, mm."""
+        z = self.gather(x)
+        corners = self.case.profile.points
+        out: dict[str, float] = {}
+        for term in self.terms:
+            nodes, gaps = gap_at_nodes(term.pair, z)
+            positions = node_positions(term.pair.slave, nodes)
+            for name in ("K", "L", "M"):
+                near = np.linalg.norm(positions - corners[name], axis=1) < 1e-6 * self.case.profile.radius
+                if near.any() and name not in out:
+                    out[name] = float(gaps[near][0])
+        return out
+
+    def zones_of(self, node: int) -> str:
+        """The zones that a node of z belongs to, in words."""
+        zones = [t.pair.name for t in self.terms if node in t.pair.slave.nodes or node in t.pair.die.nodes]
+        return f"zone {' and '.join(zones)}" if zones else "away from the zones"
+
+
+def node_positions(surface: Surface, nodes: Index) -> Array:
+    """Reference positions of some nodes of a surface, ``shape=(n, 2)``, mm."""
+    number, first = np.unique(surface.nodes, return_index=True)
+    return np.asarray(surface.X.reshape(-1, 2)[first[np.searchsorted(number, nodes)]])
