@@ -94,6 +94,9 @@ def run(
     ] = None,
     gamma: Annotated[float | None, typer.Option(help="Dimensionless contact stiffness.")] = None,
     theta: Annotated[int | None, typer.Option(metavar="-1|0|1", help="Variant of Nitsche's method.")] = None,
+    solver: Annotated[
+        str, typer.Option(metavar="auto|surface|full", help="Newton's method on contact's forces, or on all unknowns.")
+    ] = "auto",
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for files; by default results/CASE.")] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the result as one JSON object; - is stdout.")
@@ -107,7 +110,7 @@ def run(
     )  # fmt: skip
     given = {name for name, value in changes.items() if value is not None}
     logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, format="extrusion: %(message)s")
-    with _as_options(given | {"out", "json"}):
+    with _as_options(given | {"out", "json", "solver"}):
         from extrusion.result import changed
         from extrusion.result import run as solve
 
@@ -118,7 +121,7 @@ def run(
             _check_writable("json", json_file)
         _warn_of_ranks()
         with _progress(scene, quiet) as observers:
-            result = solve(scene, out=out, observers=observers)
+            result = solve(scene, out=out, observers=observers, solver=solver)
         if json_file and _rank() == 0:
             _write_json(result, None if to_stdout else json_file)
     if not quiet and _rank() == 0:

@@ -16,28 +16,88 @@ of C are made when a force first needs them. Everything dense is on rank 0; the 
 from __future__ import annotations
 
 import logging
+import os
+import time
 import weakref
 from dataclasses import dataclass
 from typing import Any
 
-from mpi4py import MPI  # noqa: F401  (the wheel wants it first)
+from mpi4py import MPI  # noqa: F401  the wheel's PETSc needs the MPI that it loads
 from petsc4py import PETSc
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 
+from extrusion.errors import InputError
 from extrusion.gap import Array, Index
 from extrusion.problem import Problem
 from extrusion.system import System, node_positions
 
 log = logging.getLogger(__name__)
 
+SOLVERS = ("auto", "surface", "full")
+
 BLOCK = 128
 """Right-hand sides that are solved for together."""
 
 MARGIN = 32
 """Forces along the surface, to both sides of those that are needed, that are made ready with them."""
+
+
+def choose(problem: Problem, solver: str = "auto") -> System:
+    """The system to solve: on the surface, on all unknowns, or the one of these that is estimated to be cheaper.
+
+    The estimate takes `ITERATIONS` of Newton's method an increment, and the rates below; what is chosen, and why, is
+    logged. Collective.
+
+    Raises:
+        InputError: There is no such solver.
+    """
+    if solver not in SOLVERS:
+        raise InputError("solver", solver, f"choose one of {', '.join(SOLVERS)}")
+    if solver == "full":
+        return problem
+    condensed = Condensed(problem)
+    cost, memory = condensed.cost, condensed.memory
+    iterations = ITERATIONS * len(problem.case.times())
+    surface, full = cost.condensation + iterations * cost.surface, iterations * cost.full
+    fits = memory <= MEMORY_SHARE * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    chosen = "surface" if solver == "surface" or (surface < full and fits) else "full"
+    if problem.comm.rank == 0:
+        log.info(
+            "solver %s: %d of %d unknowns can carry contact forces, at most %.0f MB; estimated %.2g s on the surface, "
+            "%.2g s on all unknowns%s",
+            chosen, condensed.n_forces, problem.dofs, memory / 1e6, surface, full,
+            "" if fits else "; the surface's matrices would not fit",
+        )  # fmt: skip
+    return condensed if chosen == "surface" else problem
+
+
+ITERATIONS = 5
+"""Newton iterations an increment that the choice of a solver counts with."""
+
+MEMORY_SHARE = 0.25
+"""Part of the machine's memory that the surface's matrices may take when the solver is chosen by itself."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Estimated seconds, from counts and the rates measured on one core (EPYC, 2026): good to a factor of two."""
+
+    condensation: float  # once
+    surface: float  # of an iteration's linear algebra there
+    full: float  # of an iteration's on all unknowns
+
+    @classmethod
+    def of(cls, dofs: int, entries: float, flops: float, forces: int, read: int) -> Cost:
+        """From the entries of the bulk's factor, the flops it took, and the surface's size."""
+        active = forces / 3  # some are never reached, and of two at a node one is kept
+        return cls(
+            condensation=2.2e-10 * entries * forces,
+            surface=(0.2 * active**3 / 2e10) + 8 * 8 * active * read / 8e9 + 1e-3,
+            full=4.3e-6 * dofs + 2 * flops / 5e9,
+        )
 
 
 class Condensed(System):
@@ -115,6 +175,7 @@ class Condensed(System):
     # -- bulk ------------------------------------------------------------------------------------------------
 
     def _factor(self) -> None:
+        began = time.perf_counter()
         pc = PETSc.PC().create(self.comm)
         pc.setType("cholesky")
         pc.setFactorSolverType("mumps")
@@ -122,10 +183,20 @@ class Condensed(System):
         pc.setUp()
         self._pc, self._F = pc, pc.getFactorMatrix()
         self._drive_norm = self.full.size_of_drive()
+        self.seconds = {"factor": time.perf_counter() - began, "condensation": 0.0}
+        entries, flops = self._F.getMumpsInfog(29), self._F.getMumpsRinfog(3)
+        entries = -1e6 * entries if entries < 0 else entries  # as MUMPS counts large ones
+        self.cost = Cost.of(self.full.dofs, entries, flops, self.n_forces, self.n_read)
         # the compliance of each body, of which columns are made on demand
         self.C = [np.zeros((body.stop - body.start, 0)) for body in self.bodies]
         self.column = np.full(self.n_forces, -1)  # of each force, in its body's C
         self._forces: list[Index] = [np.zeros(0, dtype=np.int64) for _ in self.bodies]  # of each column
+
+    @property
+    def memory(self) -> float:
+        """Bytes of the compliance with all of its columns."""
+        columns = np.bincount(self.force_body, minlength=2)
+        return 8.0 * sum(int(n) * (body.stop - body.start) for n, body in zip(columns, self.bodies, strict=True))
 
     @property
     def right_hand_sides(self) -> int:
@@ -139,6 +210,7 @@ class Condensed(System):
             missing = self.comm.bcast(missing if len(missing) else None)
         if missing is None or not len(missing):
             return
+        began = time.perf_counter()
         near = np.zeros(self.n_forces, dtype=bool)
         near[missing] = True
         reach = np.convolve(near, np.ones(2 * MARGIN + 1), "same") > 0
@@ -151,6 +223,7 @@ class Condensed(System):
                 self.C[body] = np.concatenate([self.C[body], *parts], axis=1)
             self.column[new] = len(self._forces[body]) + np.arange(len(new))
             self._forces[body] = np.concatenate([self._forces[body], new])
+        self.seconds["condensation"] += time.perf_counter() - began
 
     def _solve(self, forces: Index, body: int) -> Array:
         """Rows of one body in K^-1 E^T for some forces on it; on rank 0."""

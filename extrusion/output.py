@@ -219,16 +219,27 @@ class Camera:
         times = case.times()
         self._wanted = {min(times, key=lambda t: abs(t - target)) for target in wanted}
         self._taken: dict[float, tuple[Array, Array]] = {}
+        self._last: tuple[Problem, Step] | None = None  # not taken yet
         self._vertices: np.ndarray | None = None  # this rank's vertex dofs
 
     def __call__(self, problem: Problem, step: Step) -> None:
-        """Take a step. Collective."""
+        """Take a step if it is wanted. Collective."""
+        self._last = problem, step
+        if step.t in self._wanted:
+            self._take(problem, step)
+
+    def close(self) -> None:
+        """Take the last step. Collective."""
+        if self._last is not None:
+            self._take(*self._last)
+
+    def _take(self, problem: Problem, step: Step) -> None:
+        self._last = None
         if self._vertices is None:
             self._survey(problem)
         fields = problem.stress_fields(step.x)
         u = problem.comm.gather(fields["displacement"].x.array.reshape(-1, 2)[self._vertices])
         mises = problem.comm.gather(fields["von_mises"].x.array[: self._cells])
-        self._taken = {t: taken for t, taken in self._taken.items() if t in self._wanted}
         if u is not None:
             self._taken[step.t] = np.concatenate(u)[self._first], np.concatenate(mises)
 

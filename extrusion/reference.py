@@ -103,12 +103,14 @@ def pressure_at_stations(state: ContactState) -> Array:
 
 def solve(case: Case) -> list[dict[str, Any]]:
     """K, reaction and pressure of one discretised problem at `TIMES`."""
+    from extrusion.condensed import choose
     from extrusion.mesh import case_mesh
     from extrusion.newton import Newton
     from extrusion.problem import Problem
     from extrusion.stepping import steps
 
     problem = Problem(case, case_mesh(case.profile, case.size))
+    system = choose(problem)
     return [
         {
             "t": step.t,
@@ -118,7 +120,7 @@ def solve(case: Case) -> list[dict[str, Any]]:
             "iterations": step.iterations,
             "dofs": problem.dofs,
         }
-        for step in steps(problem, Newton(problem), [t for t in TIMES if t <= case.end])
+        for step in steps(system, Newton(system), [t for t in TIMES if t <= case.end])
     ]
 
 

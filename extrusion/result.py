@@ -82,7 +82,8 @@ class Result:
     ranks: int
     converged: bool
     error: str | None  # why the run stopped early
-    seconds: dict[str, float]  # setup, solve, output
+    solver: str  # surface or full
+    seconds: dict[str, float]  # setup, solve, output; of solve on the surface: factor, condensation
     snapshots: Snapshots | None = field(repr=False, compare=False)  # rank 0; None without accepted steps
 
     @property
@@ -137,6 +138,7 @@ class Result:
             "dofs": self.dofs,
             "contact_points": self.contact_points,
             "ranks": self.ranks,
+            "solver": self.solver,
             "converged": self.converged,
             "seconds": dict(self.seconds),
             "steps": [
@@ -260,6 +262,7 @@ def run(
     comm: MPI.Intracomm | None = None,
     observers: Sequence[Observer] = (),
     out: str | Path | None = None,
+    solver: str = "auto",
     **changes: Any,
 ) -> Result:
     """Solve a case. Collective.
@@ -270,6 +273,8 @@ def run(
         comm: Ranks that share the work; all by default.
         observers: Called as ``observer(problem, step)`` after each accepted step.
         out: Folder for files and pictures; without it nothing is written.
+        solver: "surface" (the bulk factored once, Newton's method on the forces of contact), "full" (on all unknowns),
+            or "auto": the one that is estimated to be cheaper. Both give the same answer.
         **changes: See `changed`: ``run(cases.A, order=2, method="nitsche", increment=10)``.
 
     Returns:
@@ -284,6 +289,7 @@ def run(
     from mpi4py import MPI
 
     from extrusion import output
+    from extrusion.condensed import choose
     from extrusion.newton import Newton
     from extrusion.problem import Problem
     from extrusion.stepping import steps
@@ -293,19 +299,22 @@ def run(
     plain = None if isinstance(mesh, str | Path) else mesh
     case = changed(case, mesh=given, **changes)
     problem = Problem(case, _mesh(comm, case, plain), comm)
-    newton = Newton(problem)
+    seconds = {"setup": time.perf_counter() - start, "solve": 0.0, "output": 0.0}
+    began = time.perf_counter()
+    system = choose(problem, solver)
+    newton = Newton(system)
+    seconds["solve"] += time.perf_counter() - began
     camera = output.Camera(case, PICTURED)
     folder = None if out is None else output.Folder(out, comm)
     watching = [camera, *(() if folder is None else folder.observers), *observers]
-    seconds = {"setup": time.perf_counter() - start, "solve": 0.0, "output": 0.0}
 
     accepted: list[Step] = []
     error = None
     try:
-        with closing(_timed(steps(problem, newton, case.times()), seconds, "solve")) as stepping:
+        with closing(_timed(steps(system, newton, case.times()), seconds, "solve")) as stepping:
             for step in stepping:
                 began = time.perf_counter()
-                accepted.append(dataclasses.replace(step, x=None))
+                accepted.append(dataclasses.replace(step, recover=_gone))
                 for observer in watching:
                     observer(problem, step)
                 seconds["output"] += time.perf_counter() - began
@@ -314,6 +323,7 @@ def run(
     for observer in watching:
         if close := getattr(observer, "close", None):
             close()
+    seconds |= getattr(system, "seconds", {})
     points = sum(len(state.gap) for state in accepted[-1].zones.values()) if accepted else 0
     result = Result(
         case=case,
@@ -323,12 +333,17 @@ def run(
         ranks=comm.size,
         converged=error is None,
         error=error,
+        solver="surface" if system is not problem else "full",
         seconds=seconds,
         snapshots=camera.snapshots(),
     )
     if folder is not None:
-        folder.finish(result, {"mesh": given, **changes})
+        folder.finish(result, {"mesh": given, "solver": solver, **changes})
     return result
+
+
+def _gone() -> Any:
+    raise RuntimeError("the field of a step is gone once the run is over: take it in an observer")
 
 
 def _figure(figure: Figure, step: Step) -> float:

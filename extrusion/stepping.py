@@ -7,7 +7,7 @@ files, pictures and progress bars observe it, and the loop does not know them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from petsc4py import PETSc
@@ -53,7 +53,12 @@ class Step:
     gap: dict[str, float]  # at the named slave points, mm
     caught: dict[str, float]  # per bilateral zone: how far from the die the points were that it now holds for good, mm
     zones: dict[str, ContactState] = field(repr=False)
-    x: PETSc.Vec = field(repr=False, compare=False)  # live: copy what must outlast the step
+    recover: Callable[[], PETSc.Vec] = field(repr=False, compare=False)  # as long as no other step has been taken
+
+    @property
+    def x(self) -> PETSc.Vec:
+        """All displacements, mm (`Problem.x`). Live, and collective: copy what must outlast the step."""
+        return self.recover()
 
 
 def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]:
@@ -119,7 +124,7 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
             gap=problem.point_gaps(x),
             caught=caught,
             zones={term.pair.name: term.state(z) for term in problem.terms},
-            x=x,
+            recover=lambda: problem.recover(x),
         )
         caught = dict.fromkeys(caught, 0.0)
 

@@ -45,15 +45,16 @@ def test_arrays(result: Result) -> None:
     assert result.energy[-1] > result.energy[0] > 0
     assert result.iterations.sum() > 0
     assert result.gap("L").shape == (3,)
-    assert all(step.x is None for step in result.steps)
+    with pytest.raises(RuntimeError, match="observer"):
+        _ = result.steps[0].x
 
 
 def test_json(result: Result) -> None:
     """The object of ``--json``: these keys in this order, values unrounded, all of it strict JSON."""
     text = json.dumps(result.to_dict(), allow_nan=False)
     data = json.loads(text)
-    assert " ".join(data) == "case method order die dofs contact_points ranks converged seconds steps"
-    assert list(data["seconds"]) == ["setup", "solve", "output"]
+    assert " ".join(data) == "case method order die dofs contact_points ranks solver converged seconds steps"
+    assert list(data["seconds"]) == ["setup", "solve", "output", "factor", "condensation"]
     step, last = data["steps"][-1], result.steps[-1]
     assert " ".join(step) == "t points reaction energy iterations cuts gap"
     assert step["points"]["K"] == list(last.points["K"])
