@@ -213,7 +213,7 @@ class Condensed(System):
         began = time.perf_counter()
         near = np.zeros(self.n_forces, dtype=bool)
         near[missing] = True
-        reach = np.convolve(near, np.ones(2 * MARGIN + 1), "same") > 0
+        reach = np.convolve(near, np.ones(2 * MARGIN + 1))[MARGIN:-MARGIN] > 0
         have = np.zeros(self.n_forces, dtype=bool)
         have[np.concatenate(self._forces)] = True
         for body in (0, 1):
