@@ -112,6 +112,10 @@ class System(ABC):
         for term in self.terms:
             term.accept(z)
 
+    def expect(self, on: bool) -> bool:
+        """Take the accepted contact set, where it stood in the die, as given; say if any zone has one."""
+        return any([term.expect(on) for term in self.terms])
+
     # -- reports ---------------------------------------------------------------------------------------------
 
     @abstractmethod

@@ -95,6 +95,9 @@ class ContactTerm(Protocol):
     def accept(self, z: Array) -> None:
         """Make z the accepted state."""
 
+    def expect(self, on: bool) -> bool:
+        """Take the accepted contact set, where it stood in the die, for the one that will be; say if there is one."""
+
     def state(self, z: Array) -> ContactState:
         """Report at z."""
 
@@ -106,6 +109,24 @@ def closed_at_start(gap: Array, radius: float, interpenetrating: bool) -> np.nda
     """Points that a bilateral zone holds from t = 0: gap zero, or also negative where the start may interpenetrate."""
     touching = np.abs(gap) < CLOSED_GAP * radius
     return touching | (gap < 0) if interpenetrating else touching
+
+
+@dataclass(frozen=True)
+class ContactSet:
+    """Which of some positions along the die (sorted, mm) are closed."""
+
+    at: Array
+    closed: np.ndarray
+
+    @classmethod
+    def of(cls, at: Array, closed: np.ndarray) -> ContactSet:
+        """From positions in any order."""
+        order = np.argsort(at, axis=None)
+        return cls(at.ravel()[order], closed.ravel()[order])
+
+    def __call__(self, at: Array) -> np.ndarray:
+        """Whether positions are closed: as the next known one is."""
+        return np.asarray(self.closed[np.minimum(np.searchsorted(self.at, at), len(self.at) - 1)])
 
 
 class NodalContact:
@@ -155,6 +176,9 @@ class NodalContact:
 
     def settled(self, z: Array) -> bool:
         return True
+
+    def expect(self, on: bool) -> bool:
+        return False
 
     def stiffness_norm(self) -> float:
         return float(np.linalg.norm(self._kappa)) if self.multipliers else 0.0
@@ -245,6 +269,8 @@ class IntegratedContact:
         self.forced = _forced(pair, behind=bool(theta) and material is not None)
         self._radius, self._interpenetrating, self._order = radius, interpenetrating, order
         self.closed, self.caught = np.zeros(len(pair.slave.nodes), dtype=bool), 0.0
+        self._accepted: ContactSet | None = None
+        self._expects = False
 
     def start(self, z: Array) -> None:
         points = self._points(z, False)[0]
@@ -256,6 +282,16 @@ class IntegratedContact:
 
     def settled(self, z: Array) -> bool:
         return True
+
+    def expect(self, on: bool) -> bool:
+        self._expects = on and self._accepted is not None
+        return self._expects
+
+    def _along(self, z: Array, points: Points) -> Array:
+        """Positions of the points along the die, mm."""
+        slave, c = self.pair.slave, 1 - self.pair.axis
+        nodal = slave.X[..., c] + z[2 * slave.nodes + c]
+        return np.einsum("nqi,ni->nq", shape(points.xi, slave.nodes.shape[1]), nodal[points.facet])
 
     def stiffness_norm(self) -> float:
         if self.pair.closure == "check":
@@ -309,7 +345,10 @@ class IntegratedContact:
         k = self._k[points.facet][:, None]
         own = np.einsum("nql,nl->nq", S, z[points.cols]) if S is not None else np.zeros_like(points.gap)
         held = np.broadcast_to(self.closed[points.facet][:, None], own.shape)
-        sc, dsc = project(own + k * points.gap, self.pair.closure, held)
+        closure = self.pair.closure
+        if self._expects and self._accepted is not None:
+            held, closure = self._accepted(self._along(z, points)), "bilateral"
+        sc, dsc = project(own + k * points.gap, closure, held)
         if not self.pair.extended:
             sc, dsc = np.where(points.past, 0.0, sc), np.where(points.past, 0.0, dsc)
         return own, sc, dsc, k
@@ -394,9 +433,13 @@ class IntegratedContact:
         return (rows, across, (GS + np.swapaxes(GS, 1, 2)).ravel()), GG.ravel()
 
     def accept(self, z: Array) -> None:
-        if self.pair.closure == "bilateral":
-            points, S, _ = self._points(z, False)
-            _, _, dsc, _ = self._law(z, points, S)
+        if self.pair.closure == "check":
+            return
+        points, S, _ = self._points(z, False)
+        _, _, dsc, _ = self._law(z, points, S)
+        if self.pair.closure == "unilateral":
+            self._accepted = ContactSet.of(self._along(z, points), dsc > 0) if np.any(dsc > 0) else None
+        else:
             before = self.closed
             self.closed = before | self._whole_facets(points, dsc > 0)
             self.caught = _farthest(points.gap, (self.closed & ~before)[points.facet])
@@ -443,6 +486,8 @@ class MortarContact:
         self._total = vertex_weights(pair.slave, pair.axisymmetric)
         self.closed, self.caught = np.zeros(m + 1, dtype=bool), 0.0
         self._settled: np.ndarray | None = None  # rows let go, where that is not left to each iterate
+        self._accepted: ContactSet | None = None
+        self._expects = False
 
     def start(self, z: Array) -> None:
         points = self._points(z, False)
@@ -491,7 +536,10 @@ class MortarContact:
 
     def _law(self, z: Array, points: Points) -> tuple[Array, Array, Array]:
         weak, share, w = self._rows(points)
-        sc, dsc = project(self._total * z[self.at] + self._k * weak, self.pair.closure, self.closed)
+        held, closure = self.closed, self.pair.closure
+        if self._expects and self._accepted is not None:
+            held, closure = self._accepted(self._along(z)), "bilateral"
+        sc, dsc = project(self._total * z[self.at] + self._k * weak, closure, held)
         free = self._free(share)
         return np.where(free, 0.0, sc), np.where(free, 0.0, dsc), w
 
@@ -562,7 +610,20 @@ class MortarContact:
             np.concatenate([J.ravel(), (dsc - 1.0) * self._total]),
         )
 
+    def expect(self, on: bool) -> bool:
+        self._expects = on and self._accepted is not None
+        return self._expects
+
+    def _along(self, z: Array) -> Array:
+        """Positions of the multipliers' nodes along the die, mm."""
+        slave, c = self.pair.slave, 1 - self.pair.axis
+        at = slave.X[:, :2, c] + z[2 * slave.nodes[:, :2] + c]
+        return np.append(at[:, 0], at[-1:, 1])
+
     def accept(self, z: Array) -> None:
+        if self.multipliers and self.pair.closure == "unilateral":
+            dsc = self._law(z, self._points(z, False))[1]
+            self._accepted = ContactSet.of(self._along(z), dsc > 0) if np.any(dsc > 0) else None
         if self.multipliers and self.pair.closure == "bilateral":
             points, before = self._points(z, False), self.closed
             self.closed = (before | (self._law(z, points)[1] > 0)) & ~self._free(self._rows(points)[1])
