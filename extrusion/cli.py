@@ -6,6 +6,7 @@ that need it, so that help and lists are quick.
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import logging
 import os
@@ -225,6 +226,32 @@ def study(
         table.add_row(*map(str, row))
     Console().print(table)
     hard_cases.draw(rows, path.with_suffix(".png"))
+
+
+@app.command()
+def bench(
+    quick: Annotated[bool, typer.Option("--quick", help="A small part of it, on shipped meshes: two minutes.")] = False,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of its tables and picture.")] = Path("results/bench"),
+) -> None:
+    """Measure speed against error, or what is left to measure (half an hour); writes tables and a picture."""
+    from extrusion.check import require_dolfinx
+
+    require_dolfinx()
+    from extrusion import bench as speed
+
+    if importlib.util.find_spec("matplotlib") is None:
+        raise InputError("matplotlib", "not installed", 'pip install "extrusion[plot]"')
+    if _rank() != 0:
+        return
+    _check_writable("--out", out / "runs.jsonl")
+
+    def tell(number: int, of: int, cell: speed.Cell, outcome: speed.Outcome) -> None:
+        told = outcome.note or f"{outcome.wall:.2f} s, {outcome.iterations} iterations"
+        _say(f"{number} of {of}: {cell}: {outcome.status}, {told}")
+
+    with _as_options({"out"}):
+        here, runs = speed.run(out, quick=quick, progress=tell)
+    print(speed.write(out, here, runs))
 
 
 @app.command()

@@ -91,10 +91,10 @@ class Cost:
 
     @classmethod
     def of(cls, dofs: int, entries: float, flops: float, forces: int, read: int) -> Cost:
-        """From the entries of the bulk's factor, the flops it took, and the surface's size."""
+        """From entries of the bulk's factors times right-hand sides, the flops these took, and the surface's size."""
         active = forces / 3  # some are never reached, and of two at a node one is kept
         return cls(
-            condensation=2.2e-10 * entries * forces,
+            condensation=2.2e-10 * entries,
             surface=(0.2 * active**3 / 2e10) + 8 * 8 * active * read / 8e9 + 1e-3,
             full=4.3e-6 * dofs + 2 * flops / 5e9,
         )
@@ -176,21 +176,21 @@ class Condensed(System):
 
     def _factor(self) -> None:
         began = time.perf_counter()
-        pc = PETSc.PC().create(self.comm)
-        pc.setType("cholesky")
-        pc.setFactorSolverType("mumps")
-        pc.setOperators(self.full.bulk())
-        pc.setUp()
-        self._pc, self._F = pc, pc.getFactorMatrix()
-        self._drive_norm = self.full.size_of_drive()
-        self.seconds = {"factor": time.perf_counter() - began, "condensation": 0.0}
-        entries, flops = self._F.getMumpsInfog(29), self._F.getMumpsRinfog(3)
-        entries = -1e6 * entries if entries < 0 else entries  # as MUMPS counts large ones
-        self.cost = Cost.of(self.full.dofs, entries, flops, self.n_forces, self.n_read)
+        self._bulk = [_Factor(A, rows) for A, rows in self.full.bulk()]
         # the compliance of each body, of which columns are made on demand
         self.C = [np.zeros((body.stop - body.start, 0)) for body in self.bodies]
         self.column = np.full(self.n_forces, -1)  # of each force, in its body's C
         self._forces: list[Index] = [np.zeros(0, dtype=np.int64) for _ in self.bodies]  # of each column
+        self._drive_norm = self.full.size_of_drive()
+        self.seconds = {"factor": time.perf_counter() - began, "condensation": 0.0}
+        bodies = np.bincount(self.force_body, minlength=2)
+        self.cost = Cost.of(
+            self.full.dofs,
+            sum(factor.entries * int(n) for factor, n in zip(self._bulk, bodies, strict=False)),
+            sum(factor.flops for factor in self._bulk),
+            self.n_forces,
+            self.n_read,
+        )
 
     @property
     def memory(self) -> float:
@@ -227,35 +227,7 @@ class Condensed(System):
 
     def _solve(self, forces: Index, body: int) -> Array:
         """Rows of one body in K^-1 E^T for some forces on it; on rank 0."""
-        n, n_local, row0 = self.full.bulk_size
-        size = len(forces)
-        at = self._force_dofs[forces]
-        X = PETSc.Mat().createDense(((n_local, n), (None, size)), comm=self.comm)
-        X.setUp()
-        if self.comm.size == 1:  # sparse right-hand sides cost half, but MUMPS wants them on one rank
-            ones = np.ones(size)
-            csr = np.arange(size + 1, dtype=PETSc.IntType), at.astype(PETSc.IntType), ones
-            rows = PETSc.Mat().createAIJ((size, n), csr=csr, comm=self.comm)
-            B = PETSc.Mat().createTranspose(rows)
-        else:
-            B = X.duplicate()
-            mine = (at >= row0) & (at < row0 + n_local)
-            B.getDenseArray()[at[mine] - row0, np.flatnonzero(mine)] = 1.0
-            B.assemble()
-        X.assemble()
-        self._F.matSolve(B, X)
-        rows_of = self.dofs[self.bodies[body]]
-        mine = np.flatnonzero((rows_of >= row0) & (rows_of < row0 + n_local))
-        values = X.getDenseArray()[rows_of[mine] - row0]
-        B.destroy()
-        X.destroy()
-        if self.comm.size == 1:
-            return np.asarray(values)
-        parts = self.comm.gather((mine, values))
-        out = np.zeros((len(rows_of), size))
-        for where, part in parts or ():
-            out[where] = part
-        return out
+        return self._bulk[body].solve(self._force_dofs[forces], self.dofs[self.bodies[body]])
 
     def _displacements(self, f: Array) -> Array:
         """-C f at all rows."""
@@ -305,15 +277,13 @@ class Condensed(System):
         values = np.array(x.array_r)
         if self.comm.size > 1:
             values = self.comm.bcast(values)
-        b = self._pc.getOperators()[0].createVecRight()
-        u = b.duplicate()
-        _, _, row0 = full.bulk_size
-        mine = (self._force_dofs >= row0) & (self._force_dofs < row0 + b.local_size)
-        b.array[self._force_dofs[mine] - row0] = -values[1 : 1 + self.n_forces][mine]
-        self._pc.apply(b, u)
-        full.set_displacements(u, values[0], values[1 + self.n_forces :])
-        b.destroy()
-        u.destroy()
+        out = np.zeros(full.n_local)
+        first, f = full.x.owner_range[0], values[1 : 1 + self.n_forces]
+        for body, factor in enumerate(self._bulk):
+            on = np.flatnonzero(self.force_body == body)
+            rows, u = factor.back(self._force_dofs[on], -f[on])
+            out[rows - first] = u
+        full.set_displacements(out, values[0], values[1 + self.n_forces :])
         return full.x
 
     # -- equations -------------------------------------------------------------------------------------------
@@ -361,7 +331,7 @@ class Condensed(System):
         """Flexible GMRES, preconditioned by a dense factorisation over the forces that act."""
         ksp.setType("fgmres")
         ksp.setGMRESRestart(self._tangent.STALE)  # where it is factored anew it starts from the residual
-        ksp.setTolerances(rtol=1e-7, atol=1e-50, max_it=60)
+        ksp.setTolerances(rtol=self._tangent.rtol, atol=1e-50, max_it=60)
         pc = ksp.getPC()
         pc.setType("python")
         pc.setPythonContext(self._tangent)
@@ -443,6 +413,74 @@ class Condensed(System):
         return str(self.comm.bcast(text))
 
 
+class _Factor:
+    """The factored bulk matrix of one body.
+
+    Args:
+        A: The matrix.
+        rows: Which entries of the full x its rows are (all ranks'), increasing on each rank.
+    """
+
+    def __init__(self, A: PETSc.Mat, rows: Index) -> None:
+        self._A, self._rows, self._comm = A, rows, A.comm.tompi4py()
+        self._order = np.argsort(rows)
+        self._pc = PETSc.PC().create(A.comm)
+        self._pc.setType("cholesky")
+        self._pc.setFactorSolverType("mumps")
+        self._pc.setOperators(A)
+        self._pc.setUp()
+        self._F = self._pc.getFactorMatrix()
+        entries = float(self._F.getMumpsInfog(29))
+        self.entries = -1e6 * entries if entries < 0 else entries  # as MUMPS counts large ones
+        self.flops = float(self._F.getMumpsRinfog(3))
+        self._X: PETSc.Mat | None = None
+
+    def _at(self, entries: Index) -> Index:
+        return np.asarray(self._order[np.searchsorted(self._rows, entries, sorter=self._order)])
+
+    def solve(self, forces: Index, read: Index) -> Array:
+        """Entries ``read`` of the solution for a unit force at each of ``forces`` (a column each); on rank 0."""
+        comm, n, size = self._comm, self._A.size[0], len(forces)
+        first, end = self._A.owner_range
+        at, wanted = self._at(forces), self._at(read)
+        if self._X is None or self._X.size[1] != size:
+            self._X = PETSc.Mat().createDense(((end - first, n), (None, size)), comm=comm)
+            self._X.setUp()
+            self._X.assemble()
+        X = self._X
+        if comm.size == 1:  # sparse right-hand sides cost half, but MUMPS wants them on one rank
+            csr = np.arange(size + 1, dtype=PETSc.IntType), at.astype(PETSc.IntType), np.ones(size)
+            B = PETSc.Mat().createTranspose(PETSc.Mat().createAIJ((size, n), csr=csr, comm=comm))
+        else:
+            B = X.duplicate()
+            mine = (at >= first) & (at < end)
+            B.getDenseArray()[at[mine] - first, np.flatnonzero(mine)] = 1.0
+            B.assemble()
+        self._F.matSolve(B, X)
+        B.destroy()
+        mine = np.flatnonzero((wanted >= first) & (wanted < end))
+        values = X.getDenseArray()[wanted[mine] - first]
+        if comm.size == 1:
+            return np.ascontiguousarray(values)
+        out = np.zeros((len(wanted), size))
+        for where, part in comm.gather((mine, values)) or ():
+            out[where] = part
+        return out
+
+    def back(self, forces: Index, values: Array) -> tuple[Index, Array]:
+        """This rank's rows, and the solution there, for these values at ``forces`` (given on every rank)."""
+        b, u = self._A.createVecs()
+        first, end = self._A.owner_range
+        at = self._at(forces)
+        mine = (at >= first) & (at < end)
+        b.array[at[mine] - first] = values[mine]
+        self._pc.apply(b, u)
+        out = self._rows[first:end], np.array(u.array_r)
+        b.destroy()
+        u.destroy()
+        return out
+
+
 @dataclass(frozen=True)
 class _Derivative:
     """Triplets of contact forces and multiplier rows by displacements read and multipliers."""
@@ -463,6 +501,9 @@ class _Tangent:
 
     is solved by a dense factorisation. Rows that are not parallel (at the die's corners, at the billet's edge) are all
     kept. The factorisation serves until the Krylov method, for which the change of D is small, takes too long with it.
+
+    Where there are many forces all of this is in single precision, of which Newton's method, whose residual is not,
+    takes no harm: it gains six digits an iteration.
     """
 
     PARALLEL = 0.1
@@ -471,8 +512,13 @@ class _Tangent:
     STALE = 12
     """Krylov iterations after which a factorisation of an earlier tangent is made anew."""
 
+    MANY = 1200
+    """Forces from which on single precision pays."""
+
     def __init__(self, system: Condensed) -> None:
         self._system = weakref.proxy(system)  # PETSc holds this object in C
+        self._dtype: Any = np.float32 if system.n_forces > self.MANY else np.float64
+        self.rtol = 1e-6 if self._dtype == np.float32 else 1e-11
         self._forces = np.zeros(0, dtype=np.int64)  # in the order of the rows that follow
         self._pressures = np.zeros(0, dtype=np.int64)
         self._read = [np.zeros(0, dtype=np.int64) for _ in range(2)]  # rows of each body's C that D reads
@@ -528,7 +574,7 @@ class _Tangent:
             self._read = [np.flatnonzero(read[span]) for span in system.bodies]
             self._columns = [np.flatnonzero(system.force_body[forces] == body) for body in range(2)]
             self._C = [
-                C[np.ix_(rows, system.column[forces[columns]])]
+                C[np.ix_(rows, system.column[forces[columns]])].astype(self._dtype)
                 for C, rows, columns in zip(system.C, self._read, self._columns, strict=True)
             ]
         n_rows = len(self._forces) + len(self._pressures)
@@ -544,7 +590,7 @@ class _Tangent:
         r, c = row[D.rows], col[D.cols]
         on = (r >= 0) & (c >= 0)
         shape = n_rows, first + len(self._pressures)
-        self._D = scipy.sparse.coo_array((D.values[on], (r[on], c[on])), shape=shape).tocsr()
+        self._D = scipy.sparse.coo_array((D.values[on].astype(self._dtype), (r[on], c[on])), shape=shape).tocsr()
 
     def _factor(self, parallel: float) -> None:
         lead, follower, slope = self._leaders(parallel)
@@ -554,7 +600,7 @@ class _Tangent:
         self._two, self._follower, self._slope = two, follower[two], slope[two]
         self._lead = lead
         self._D_kept = D = self._D[self._kept]
-        M = np.zeros((n + m, n + m))
+        M = np.zeros((n + m, n + m), dtype=self._dtype)
         first = 0
         of_lead = self._system.force_body[self._forces[lead]]
         for body, (C, columns) in enumerate(zip(self._C, self._columns, strict=True)):
@@ -563,7 +609,7 @@ class _Tangent:
             mine = np.flatnonzero(of_lead == body)
             C_E = C[:, place[lead[mine]]]
             with_two = np.flatnonzero(follower[mine] >= 0)
-            C_E[:, with_two] += slope[mine[with_two]] * C[:, place[follower[mine[with_two]]]]
+            C_E[:, with_two] += slope.astype(self._dtype)[mine[with_two]] * C[:, place[follower[mine[with_two]]]]
             M[:, mine] = D[:, first : first + len(C)] @ C_E
             first += len(C)
         M[n:, :n] *= -1.0
@@ -600,6 +646,7 @@ class _Tangent:
 
     def _image(self, D: Any, f: Array, p: Array) -> Array:
         """Rows of D by the displacements of some forces, and by pressures."""
+        f, p = f.astype(self._dtype), p.astype(self._dtype)
         u = [C @ f[columns] for C, columns in zip(self._C, self._columns, strict=True)]
         return np.asarray(D @ np.concatenate([-u[0], -u[1], p]))
 

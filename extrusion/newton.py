@@ -136,7 +136,7 @@ class Newton:
     def _predict(self, x: PETSc.Vec) -> int:
         """One linear solve with the accepted contact set, which stands still in the die as the billet slides by.
 
-        Newton's method would find the ends of the contact by steps of a few facets. Kept unless it raises the residual much.
+        Newton's method would find the ends of the contact by steps of a few facets. Kept unless the residual grows.
 
         Returns:
             How many linear solves it took.

@@ -289,16 +289,27 @@ class Problem(System):
 
     # -- what the condensed problem asks ---------------------------------------------------------------------
 
-    @property
-    def bulk_size(self) -> tuple[int, int, int]:
-        """Rows of the bulk matrix and of its part on this rank, and the first of these."""
-        return self.n, self.n_local, self._row0
+    def bulk(self) -> list[tuple[PETSc.Mat, Index]]:
+        """The bulk matrix of each body (no multipliers), identity at the supports; which entries of x are its rows.
 
-    def bulk(self) -> PETSc.Mat:
-        """The bulk matrix with the identity at the supports and for the multipliers."""
+        The rows are those of all ranks, in order; each rank holds those of its own.
+        """
+        none = np.zeros(0, dtype=np.int64)
+        A = self._tangent.fill(none, none, np.zeros(0))
+        of_billet = np.zeros(self.n_local, dtype=bool)
+        blocks = self._blocks_of("billet")
+        blocks = blocks[blocks < self._owned // 2]
+        of_billet[np.concatenate([2 * blocks, 2 * blocks + 1])] = True
+        of_billet[self._owned : self._owned + self._n_pressures] = True
         last = self.comm.rank == self.comm.size - 1
-        own = self.n_local - self.n_multipliers + np.arange(self.n_multipliers) if last else np.zeros(0, dtype=np.int64)
-        return self._tangent.fill(own, own + self._row0, np.ones(len(own)))
+        unknown = np.arange(self.n_local) < self.n_local - (self.n_multipliers if last else 0)
+        out = []
+        for mine in (of_billet, ~of_billet & unknown):
+            rows = np.flatnonzero(mine) + self._row0
+            if self.comm.allreduce(len(rows)):
+                keep = PETSc.IS().createGeneral(rows.astype(PETSc.IntType), comm=self.comm)
+                out.append((A.createSubMatrix(keep, keep), np.concatenate(self.comm.allgather(rows))))
+        return out
 
     def places_of(self, points: dict[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
         """Global entries of x that hold the displacement of points given by rank and local block."""
@@ -310,9 +321,9 @@ class Problem(System):
         moved = all_ranks(self.comm, self._billet_y + self._row0)
         return np.isin(entries, moved).astype(float)
 
-    def set_displacements(self, u: PETSc.Vec, t: float, multipliers: Array) -> None:
-        """Set x to u with the billet moved along y by t; the supports take their values."""
-        u.copy(self.x)
+    def set_displacements(self, values: Array, t: float, multipliers: Array) -> None:
+        """Set x to this rank's values with the billet moved along y by t; the supports take their values."""
+        self.x.array[:] = values
         self.shift_billet(self.x, t)
         self.drive(self.x, t)
         if self.comm.rank == self.comm.size - 1:

@@ -1,0 +1,105 @@
+"""The surface solve gives what the full one does, and makes no more right-hand sides than contact reaches."""
+
+import logging
+from dataclasses import replace
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from extrusion import cases
+from extrusion.cases import Case
+from extrusion.condensed import Condensed, choose
+from extrusion.errors import InputError
+from extrusion.mesh import case_mesh, on_root
+from extrusion.newton import Newton
+from extrusion.problem import Problem
+from extrusion.reference import problems
+from extrusion.stepping import Step, steps
+from extrusion.system import System
+
+UNILATERAL, MIXED = problems()["unilateral"], problems()["mixed"]
+SCENES = {
+    "nodal, P1": cases.A,
+    "nodal, die slave": cases.H,
+    **{f"{m}, {d}": replace(MIXED, method=m, die=d) for m in ("nitsche", "mortar") for d in ("elastic", "rigid")},
+    "penalty, P1": replace(UNILATERAL, method="penalty", order=1),
+    "theta 1": replace(UNILATERAL, theta=1, gamma=100.0),
+    "theta -1": replace(UNILATERAL, theta=-1),
+    "mixed": replace(MIXED, form="mixed", billet=replace(cases.BILLET, nu=0.499)),
+    "plane strain": replace(UNILATERAL, space="plane strain"),
+    "checked": UNILATERAL.with_contact("check"),
+}
+
+
+def scene(case: Case, comm: MPI.Intracomm = MPI.COMM_SELF) -> Problem:
+    """On the sheet's divisions."""
+    return Problem(case, on_root(comm, lambda: case_mesh(case.profile, case.mesh_size)), comm)
+
+
+def reported(system: System, times: list[float]) -> tuple[list[list[float]], Step]:
+    """What each step reports (mm, MN, kJ), and the last step."""
+    rows = []
+    for step in steps(system, Newton(system), times):
+        points = [u for name in sorted(step.points) for u in step.points[name]]
+        forces = [step.reaction / 1e6, step.die_reaction / 1e6, step.energy / 1e6]
+        rows.append([*points, *forces, *step.gap.values()])
+    return rows, step
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_surface_is_full(name: str) -> None:
+    """A force on the wrong body, a column of the compliance in the wrong place, a pairing that is never renewed."""
+    case = SCENES[name]
+    if case.method != "nodal":
+        case = replace(case, size=None)
+    problem, times = scene(case), [5.0, 10.0, 15.0, 20.0, 30.0, 40.0]
+    expected, last = reported(problem, times)
+    full = np.array(problem.x.array_r)
+    system = Condensed(problem)
+    found, last = reported(system, times)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(last.x.array_r[: len(full)], full, rtol=1e-9, atol=1e-8)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("name", ["nodal, die slave", "nitsche, elastic", "mortar, rigid", "mixed"])
+def test_two_ranks_are_one(name: str) -> None:
+    """Columns gathered in another order than they were asked for; a rank that waits for another."""
+    ends = []
+    for comm in (MPI.COMM_WORLD, MPI.COMM_SELF):
+        problem = scene(SCENES[name], comm)
+        rows, _ = reported(Condensed(problem), [5.0, 20.0, 40.0])
+        ends.append((rows, problem.reactions(problem.x) if comm is MPI.COMM_SELF else None))
+    np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=0, atol=1e-9)
+
+
+def test_only_what_is_reached_is_solved_for() -> None:
+    """A right-hand side for every die point: up to t = 20 the exit and the cone are never touched."""
+    system = Condensed(scene(replace(UNILATERAL, size=2.0)))
+    list(steps(system, Newton(system), [5.0, 20.0]))
+    assert 0 < system.right_hand_sides < 0.75 * system.n_forces
+
+
+def test_choice(caplog: pytest.LogCaptureFixture) -> None:
+    """A choice that says nothing, or that ignores what it is told."""
+    problem = scene(UNILATERAL)
+    with caplog.at_level(logging.INFO):
+        assert isinstance(choose(problem), Condensed)
+    assert "solver surface" in caplog.text
+    assert "estimated" in caplog.text
+    assert choose(problem, "full") is problem
+    assert isinstance(choose(problem, "surface"), Condensed)
+    with pytest.raises(InputError, match="solver"):
+        choose(problem, "fast")
+
+
+def test_prediction_saves_iterations() -> None:
+    """A contact set carried along with the billet instead of the die."""
+    system = Condensed(scene(replace(UNILATERAL, size=2.0)))
+    times = list(np.arange(5.0, 101.0, 5.0))
+    with_, without = (
+        sum(s.iterations for s in steps(system, Newton(system, predicts=p), times)) for p in (True, False)
+    )
+    assert with_ < 0.95 * without
