@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, cast
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -29,6 +29,7 @@ from extrusion.contact import CLOSURES
 from extrusion.errors import InputError
 
 if TYPE_CHECKING:
+    from extrusion.estimate import Goal
     from extrusion.problem import Problem
     from extrusion.result import Observer, Result
     from extrusion.stepping import Step
@@ -98,6 +99,11 @@ def run(
     solver: Annotated[
         str, typer.Option(metavar="auto|surface|full", help="Newton's method on contact's forces, or on all unknowns.")
     ] = "auto",
+    tolerance: Annotated[
+        float | None,
+        typer.Option(metavar="X", help="Relative error of the goal, for which the cheapest model is chosen."),
+    ] = None,
+    goal: Annotated[str, typer.Option(metavar="K|reaction", help="What the tolerance is of.")] = "K",
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for files; by default results/CASE.")] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the result as one JSON object; - is stdout.")
@@ -111,10 +117,17 @@ def run(
     )  # fmt: skip
     given = {name for name, value in changes.items() if value is not None}
     logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, format="extrusion: %(message)s")
-    with _as_options(given | {"out", "json", "solver"}):
+    if not quiet:
+        for name in ("condensed", "estimate"):
+            logging.getLogger(f"extrusion.{name}").setLevel(logging.INFO)
+    with _as_options(given | {"out", "json", "solver", "tolerance", "goal"}):
         from extrusion.result import changed
         from extrusion.result import run as solve
 
+        if tolerance is not None:
+            for name in ("method", "order", "size", "mesh", "form", "gamma"):
+                if name in given:
+                    raise InputError(name, changes[name], "leave it out: with --tolerance the model is chosen")
         scene = changed(_load(case), **{**changes, "mesh": str(mesh) if mesh else None})
         out = _default_folder(scene) if out is None else out
         to_stdout = json_file == Path("-")
@@ -122,12 +135,16 @@ def run(
             _check_writable("json", json_file)
         _warn_of_ranks()
         with _progress(scene, quiet) as observers:
-            result = solve(scene, out=out, observers=observers, solver=solver)
+            result = solve(
+                scene, out=out, observers=observers, solver=solver, tolerance=tolerance, goal=cast("Goal", goal)
+            )
         if json_file and _rank() == 0:
             _write_json(result, None if to_stdout else json_file)
     if not quiet and _rank() == 0:
         console = Console(stderr=to_stdout)
         console.print(result.table())
+        if result.estimate is not None:
+            console.print("\n".join(result.estimate.lines()), soft_wrap=True, highlight=False)
         console.print(f"Files are in {out}", soft_wrap=True, highlight=False)
     if not result.converged:
         _say(f"{result.error} (accepted steps are kept in {out})")
@@ -139,9 +156,17 @@ def verify(
     cases: Annotated[
         list[str] | None, typer.Argument(metavar="[CASE|FILE.toml]...", help="By default all of `extrusion list`.")
     ] = None,
+    estimates: Annotated[
+        bool, typer.Option("--estimates", help="Compare estimated errors with actual ones instead (a minute).")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
     """Run cases as the sheet states them, and compare with its figures."""
+    if estimates:
+        if cases:
+            raise InputError("CASE", " ".join(cases), "leave it out: --estimates takes all cases")
+        _verify_estimates(quiet)
+        return
     from extrusion import result
 
     table = Table(box=SIMPLE_HEAD, padding=0)
@@ -226,6 +251,32 @@ def study(
         table.add_row(*map(str, row))
     Console().print(table)
     hard_cases.draw(rows, path.with_suffix(".png"))
+
+
+def _verify_estimates(quiet: bool) -> None:
+    from extrusion.check import require_dolfinx
+
+    require_dolfinx()
+    from mpi4py import MPI
+
+    from extrusion.estimate import checks
+
+    table = Table(box=SIMPLE_HEAD, padding=0)
+    for name in ("case", "model", "error of", "estimated", "actual", "reference", "ratio"):
+        table.add_column(name, justify="left" if name in ("case", "model", "error of") else "right")
+    found = []
+    for check in checks(MPI.COMM_WORLD):
+        found.append(check)
+        figures = (f"{check.estimated:.1e}", f"{check.actual:.1e}", f"± {check.bar:.0e}", f"{check.ratio:.2f}")
+        table.add_row(check.name, check.model, check.goal, *figures, style="" if check.ok else "red")
+        if not quiet:
+            _say(f"{check.name}: {check.goal} estimated {check.estimated:.1e}, actual {check.actual:.1e}")
+    if _rank() == 0:
+        Console().print(table)
+    out = [check for check in found if not check.ok]
+    if out:
+        _say(f"{len(out)} of {len(found)} estimates are more than 2 times too small or 10 times too large")
+        raise typer.Exit(1)
 
 
 @app.command()

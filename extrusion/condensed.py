@@ -105,10 +105,11 @@ class Condensed(System):
 
     Args:
         problem: The scene. Its own x is only used by `recover`.
+        stiff_die: Let the die, though it is elastic, not give way: the rigid die, on the same mesh.
     """
 
-    def __init__(self, problem: Problem) -> None:
-        self.full = problem
+    def __init__(self, problem: Problem, stiff_die: bool = False) -> None:
+        self.full, self._stiff_die = problem, stiff_die
         self.case, self.comm, self.terms = problem.case, problem.comm, problem.terms
         self.n_z, self.n_multipliers = problem.n_z, problem.n_multipliers
         self.on_root = self.comm.rank == 0
@@ -227,6 +228,8 @@ class Condensed(System):
 
     def _solve(self, forces: Index, body: int) -> Array:
         """Rows of one body in K^-1 E^T for some forces on it; on rank 0."""
+        if body == 1 and self._stiff_die:
+            return np.zeros((self.bodies[1].stop - self.bodies[1].start, len(forces)))
         return self._bulk[body].solve(self._force_dofs[forces], self.dofs[self.bodies[body]])
 
     def _displacements(self, f: Array) -> Array:
@@ -236,6 +239,46 @@ class Condensed(System):
             if len(forces):
                 out[body] = -(C @ f[forces])
         return out
+
+    def die_effect(self, x: PETSc.Vec) -> tuple[float, float]:
+        """How an elastic die would move K (mm) and change the reaction (N), to first order.
+
+        At x, solved with a stiff die. The forces on the die give its displacements by one back-substitution; what these
+        do to the gap puts the billet out of balance, and one solve with the tangent brings it back. Collective.
+        """
+        z = self.gather(x)
+        values = self.comm.bcast(np.array(x.array_r)) if self.comm.size > 1 else np.array(x.array_r)
+        on = np.flatnonzero(self.force_body == 1)
+        rows, u = self._bulk[1].back(self._force_dofs[on], -values[1 + on])
+        parts = self.comm.allgather((rows, u))
+        rows, u = (np.concatenate(part) for part in zip(*parts, strict=True))
+        order = np.argsort(rows)
+        moved = z.copy()
+        die = np.arange(self.bodies[1].start, self.bodies[1].stop)
+        die = die[np.isin(die, self._in_z)]
+        at = order[np.searchsorted(rows, self.dofs[die], sorter=order)]
+        moved[self._z_of[np.searchsorted(self._in_z, die)]] += u[at]
+        f, y = x.duplicate(), x.duplicate()
+        out = f.array
+        if self.on_root:
+            out[0] = 0.0
+            out[1:] = self._out_of_balance(x, moved)
+        ksp = PETSc.KSP().create(self.comm)
+        self.set_solver(ksp)
+        self._tangent.forget()
+        ksp.setOperators(self.tangent(x, False))
+        ksp.solve(f, y)
+        ksp.destroy()
+        y.array[:1] = 0.0
+        K = self.point_displacements(y, {"K": self._watch["K"]})["K"][1]
+        change = 0.0
+        if self.on_root:
+            axial = self._z_y[0][self.z_forced]
+            change = float(y.array_r[1 : 1 + self.n_forces][axial].sum())
+        change = self.comm.bcast(change) if self.comm.size > 1 else change
+        f.destroy()
+        y.destroy()
+        return -K, -change
 
     # -- unknowns --------------------------------------------------------------------------------------------
 

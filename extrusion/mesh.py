@@ -61,7 +61,7 @@ ALIASES = {
 }
 """Names of the published MED meshes, lower case."""
 
-BUNDLED_SIZES = (4.0, 2.0, 1.0)
+BUNDLED_SIZES = (8.0, 4.0, 2.0, 1.0)
 """Sizes h (mm) of the graded meshes of SSNV504 that are shipped."""
 
 SSNV504_C = SSNV504.with_divisions(("L", "M", 100), ("N", "K", 100))

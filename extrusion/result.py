@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Picture
     from rich.table import Table
 
+    from extrusion.estimate import Estimate, Goal
     from extrusion.mesh import PlainMesh
     from extrusion.problem import Problem
     from extrusion.stepping import Step
@@ -85,6 +86,7 @@ class Result:
     solver: str  # surface or full
     seconds: dict[str, float]  # setup, solve, output; of solve on the surface: factor, condensation
     snapshots: Snapshots | None = field(repr=False, compare=False)  # rank 0; None without accepted steps
+    estimate: Estimate | None = None  # how far off it is, if the model was chosen for a tolerance
 
     @property
     def t(self) -> Array:
@@ -141,6 +143,7 @@ class Result:
             "solver": self.solver,
             "converged": self.converged,
             "seconds": dict(self.seconds),
+            "estimate": self.estimate and self.estimate.to_dict(),
             "steps": [
                 {
                     "t": step.t,
@@ -207,15 +210,21 @@ class Result:
     def _rows(self, chosen: Sequence[int]) -> tuple[list[str], list[list[str]]]:
         figures = {c.figure.t: c for c in self.figures() if (c.figure.point, c.figure.quantity) == ("K", "u_y")}
         gaps = [name for name in ("L", "M") if self.steps and name in self.steps[0].gap]
-        header = ["t mm", "u_y(K) mm", *(["sheet mm", "diff. %"] if figures else []), "reaction kN", "energy J"]
+        e = self.estimate
+        bars = (["± mm"], ["± kN"]) if e else ([], [])
+        header = ["t mm", "u_y(K) mm", *bars[0], *(["sheet mm", "diff. %"] if figures else [])]
+        header += ["reaction kN", *bars[1], "energy J"]
         header += [*(f"gap({name}) mm" for name in gaps), "iterations", "cuts"]
         rows = []
         for step in (self.steps[i] for i in chosen):
-            row = [f"{step.t:g}", f"{step.points['K'][1]:.3f}"]
+            K = step.points["K"][1]
+            row = [f"{step.t:g}", f"{K:.3f}", *([f"{e.error.K * abs(K):.1g}"] if e else [])]
             if figures:
                 c = figures.get(step.t)
                 row += ["", ""] if c is None else [f"{c.figure.value:.3f}", f"{100 * c.difference:+.3f}"]
-            row += [_fixed(step.reaction / 1e3, 2), _fixed(step.energy / 1e3, 2)]
+            row += [_fixed(step.reaction / 1e3, 2)]
+            row += [f"{e.error.reaction * max(e.reaction_scale, abs(step.reaction)) / 1e3:.1g}"] if e else []
+            row += [_fixed(step.energy / 1e3, 2)]
             row += [_fixed(step.gap[name], 3) for name in gaps]
             rows.append([*row, str(step.iterations), str(step.cuts)])
         return header, rows
@@ -263,6 +272,8 @@ def run(
     observers: Sequence[Observer] = (),
     out: str | Path | None = None,
     solver: str = "auto",
+    tolerance: float | None = None,
+    goal: Goal = "K",
     **changes: Any,
 ) -> Result:
     """Solve a case. Collective.
@@ -275,6 +286,9 @@ def run(
         out: Folder for files and pictures; without it nothing is written.
         solver: "surface" (the bulk factored once, Newton's method on the forces of contact), "full" (on all unknowns),
             or "auto": the one that is estimated to be cheaper. Both give the same answer.
+        tolerance: Relative error of the goal for which the cheapest model is chosen (die, order, size, zones), in place
+            of the case's own; the result has the `Estimate`.
+        goal: "K" (its u_y) or "reaction".
         **changes: See `changed`: ``run(cases.A, order=2, method="nitsche", increment=10)``.
 
     Returns:
@@ -289,24 +303,35 @@ def run(
     from mpi4py import MPI
 
     from extrusion import output
-    from extrusion.condensed import choose
+    from extrusion.condensed import SOLVERS, choose
     from extrusion.newton import Newton
     from extrusion.problem import Problem
     from extrusion.stepping import steps
 
+    if solver not in SOLVERS:
+        raise InputError("solver", solver, f"choose one of {', '.join(SOLVERS)}")
     comm = MPI.COMM_WORLD if comm is None else comm
     given = str(mesh) if isinstance(mesh, str | Path) else None
     plain = None if isinstance(mesh, str | Path) else mesh
     case = changed(case, mesh=given, **changes)
+    estimate = None
+    if tolerance is not None:
+        chosen = {"mesh": mesh, **{name: changes.get(name) for name in ("method", "order", "size", "form", "gamma")}}
+        for name, value in chosen.items():
+            if value is not None:
+                raise InputError(name, value, "leave it out: with a tolerance the model is chosen")
+        from extrusion.estimate import choose_model
+
+        case, estimate = choose_model(case, tolerance, goal, comm)
     problem = Problem(case, _mesh(comm, case, plain), comm)
     seconds = {"setup": time.perf_counter() - start, "solve": 0.0, "output": 0.0}
+    camera = output.Camera(case, PICTURED)
+    folder = None if out is None else output.Folder(out, comm)
+    watching = [camera, *(() if folder is None else folder.observers), *observers]
     began = time.perf_counter()
     system = choose(problem, solver)
     newton = Newton(system)
     seconds["solve"] += time.perf_counter() - began
-    camera = output.Camera(case, PICTURED)
-    folder = None if out is None else output.Folder(out, comm)
-    watching = [camera, *(() if folder is None else folder.observers), *observers]
 
     accepted: list[Step] = []
     error = None
@@ -336,9 +361,10 @@ def run(
         solver="surface" if system is not problem else "full",
         seconds=seconds,
         snapshots=camera.snapshots(),
+        estimate=estimate,
     )
     if folder is not None:
-        folder.finish(result, {"mesh": given, "solver": solver, **changes})
+        folder.finish(result, {"mesh": given, "solver": solver, "tolerance": tolerance, **changes})
     return result
 
 

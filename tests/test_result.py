@@ -53,7 +53,7 @@ def test_json(result: Result) -> None:
     """The object of ``--json``: these keys in this order, values unrounded, all of it strict JSON."""
     text = json.dumps(result.to_dict(), allow_nan=False)
     data = json.loads(text)
-    assert " ".join(data) == "case method order die dofs contact_points ranks solver converged seconds steps"
+    assert " ".join(data) == "case method order die dofs contact_points ranks solver converged seconds estimate steps"
     assert list(data["seconds"]) == ["setup", "solve", "output", "factor", "condensation"]
     step, last = data["steps"][-1], result.steps[-1]
     assert " ".join(step) == "t points reaction energy iterations cuts gap"
