@@ -271,9 +271,10 @@ class IntegratedContact:
         self.closed, self.caught = np.zeros(len(pair.slave.nodes), dtype=bool), 0.0
         self._accepted: ContactSet | None = None
         self._expects = False
+        self._known: tuple[Array, tuple[Points, Array | None, Array | None]] | None = None
 
     def start(self, z: Array) -> None:
-        points = self._points(z, False)[0]
+        points = self._points(z)[0]
         self.closed = self._whole_facets(points, closed_at_start(points.gap, self._radius, self._interpenetrating))
         self.caught = _farthest(points.gap, self.closed[points.facet])
 
@@ -307,9 +308,17 @@ class IntegratedContact:
         np.logical_and.at(every, points.facet, held.all(axis=1))
         return every
 
-    def _points(self, z: Array, variation: bool) -> tuple[Points, Array | None, Array | None]:
-        """Contact points with the rows of the slave's own stress and their derivative, over the points' columns."""
-        pair = self.pair
+    def _points(self, z: Array) -> tuple[Points, Array | None, Array | None]:
+        """Contact points with the rows of the slave's own stress and their derivative, over the points' columns.
+
+        With their variation, since a residual is mostly followed by the tangent at the same z; the last are remembered.
+        """
+        if self._known is None or not np.array_equal(self._known[0], z):
+            self._known = z.copy(), self._points_at(z)
+        return self._known[1]
+
+    def _points_at(self, z: Array) -> tuple[Points, Array | None, Array | None]:
+        pair, variation = self.pair, self.pair.closure != "check"
         if pair.ray:
             points = ray_points(
                 pair.slave,
@@ -356,7 +365,7 @@ class IntegratedContact:
     def add_residual(self, z: Array, R: Array) -> None:
         if self.pair.closure == "check" or (not self._theta and is_far(self.pair, z, self._radius)):
             return
-        points, S, _ = self._points(z, False)
+        points, S, _ = self._points(z)
         own, sc, _, k = self._law(z, points, S)
         force = np.einsum("nq,nql->nl", points.weight * sc, points.G)
         if S is not None and self._theta:
@@ -366,7 +375,7 @@ class IntegratedContact:
     def tangent(self, z: Array, geometric: bool) -> Triplets:
         if self.pair.closure == "check" or (not self._theta and is_far(self.pair, z, self._radius)):
             return _none()
-        points, S, S_xi = self._points(z, geometric)
+        points, S, S_xi = self._points(z)
         own, sc, dsc, k = self._law(z, points, S)
         theta = self._theta if S is not None else 0
         if not theta:  # open pieces carry nothing
@@ -435,7 +444,7 @@ class IntegratedContact:
     def accept(self, z: Array) -> None:
         if self.pair.closure == "check":
             return
-        points, S, _ = self._points(z, False)
+        points, S, _ = self._points(z)
         _, _, dsc, _ = self._law(z, points, S)
         if self.pair.closure == "unilateral":
             self._accepted = ContactSet.of(self._along(z, points), dsc > 0) if np.any(dsc > 0) else None
@@ -445,7 +454,7 @@ class IntegratedContact:
             self.caught = _farthest(points.gap, (self.closed & ~before)[points.facet])
 
     def state(self, z: Array) -> ContactState:
-        points, S, _ = self._points(z, False)
+        points, S, _ = self._points(z)
         _, sc, dsc, _ = self._law(z, points, S)
         closed = points.gap < 0 if self.pair.closure == "check" else dsc > 0
         return _state_at(self.pair, z, points, sc, closed)
@@ -488,9 +497,10 @@ class MortarContact:
         self._settled: np.ndarray | None = None  # rows let go, where that is not left to each iterate
         self._accepted: ContactSet | None = None
         self._expects = False
+        self._known: tuple[Array, Points] | None = None
 
     def start(self, z: Array) -> None:
-        points = self._points(z, False)
+        points = self._points(z)
         held = closed_at_start(points.gap, self._radius, self._interpenetrating)
         self.closed[:] = True
         np.logical_and.at(self.closed, points.facet, held.all(axis=1))
@@ -501,13 +511,13 @@ class MortarContact:
         if not settle or self.pair.extended:
             self._settled = None
             return
-        lost = self._rows(self._points(z, False))[1] < self.FACING
+        lost = self._rows(self._points(z))[1] < self.FACING
         self._settled = lost if self._settled is None else lost | self._settled
 
     def settled(self, z: Array) -> bool:
         if self._settled is None:
             return True
-        lost = self._rows(self._points(z, False))[1] < self.FACING
+        lost = self._rows(self._points(z))[1] < self.FACING
         return bool(np.all(self._settled[lost]))
 
     def _free(self, share: Array) -> np.ndarray:
@@ -516,11 +526,13 @@ class MortarContact:
             return np.zeros(len(share), dtype=bool)
         return share < self.FACING if self._settled is None else self._settled
 
-    def _points(self, z: Array, variation: bool) -> Points:
-        pair = self.pair
-        return ray_points(
-            pair.slave, pair.die, _even(z), pair.axis, pair.sign, self._order, pair.axisymmetric, variation
-        )
+    def _points(self, z: Array) -> Points:
+        """Contact points with their variation, as those of `IntegratedContact`."""
+        if self._known is None or not np.array_equal(self._known[0], z):
+            pair = self.pair
+            of = pair.slave, pair.die, _even(z), pair.axis, pair.sign, self._order, pair.axisymmetric
+            self._known = z.copy(), ray_points(*of, pair.closure != "check")
+        return self._known[1]
 
     def stiffness_norm(self) -> float:
         return float(np.linalg.norm(self._k * self._total)) if self.multipliers else 0.0
@@ -549,7 +561,7 @@ class MortarContact:
         if is_far(self.pair, z, self._radius):
             R[self.at] -= self._total * z[self.at]
             return
-        points = self._points(z, False)
+        points = self._points(z)
         sc, _, w = self._law(z, points)
         lam = z[self.at]
         p = (1 - points.xi) * lam[points.facet, None] + points.xi * lam[points.facet + 1, None]
@@ -561,7 +573,7 @@ class MortarContact:
             return _none()
         if is_far(self.pair, z, self._radius):
             return self.at, self.at, -self._total
-        points = self._points(z, geometric)
+        points = self._points(z)
         _, dsc, w = self._law(z, points)
         lam = z[self.at]
         f = points.facet
@@ -622,16 +634,16 @@ class MortarContact:
 
     def accept(self, z: Array) -> None:
         if self.multipliers and self.pair.closure == "unilateral":
-            dsc = self._law(z, self._points(z, False))[1]
+            dsc = self._law(z, self._points(z))[1]
             self._accepted = ContactSet.of(self._along(z), dsc > 0) if np.any(dsc > 0) else None
         if self.multipliers and self.pair.closure == "bilateral":
-            points, before = self._points(z, False), self.closed
+            points, before = self._points(z), self.closed
             self.closed = (before | (self._law(z, points)[1] > 0)) & ~self._free(self._rows(points)[1])
             new = self.closed & ~before
             self.caught = _farthest(points.gap, new[points.facet] & new[points.facet + 1])
 
     def state(self, z: Array) -> ContactState:
-        points = self._points(z, False)
+        points = self._points(z)
         stress, closed = np.zeros_like(points.gap), points.gap < 0
         if self.multipliers:
             lam, dsc = z[self.at], self._law(z, points)[1]
