@@ -103,7 +103,9 @@ def run(
         float | None,
         typer.Option(metavar="X", help="Relative error of the goal, for which the cheapest model is chosen."),
     ] = None,
-    goal: Annotated[str, typer.Option(metavar="K|reaction", help="What the tolerance is of.")] = "K",
+    goal: Annotated[
+        str | None, typer.Option(metavar="K|reaction", help="What the tolerance is of; by default K.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for files; by default results/CASE.")] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the result as one JSON object; - is stdout.")
@@ -124,6 +126,8 @@ def run(
         from extrusion.result import changed
         from extrusion.result import run as solve
 
+        if goal is not None and tolerance is None:
+            raise InputError("goal", goal, "it is what a tolerance is of: give --tolerance too")
         if tolerance is not None:
             for name in ("method", "order", "size", "mesh", "form", "gamma"):
                 if name in given:
@@ -136,7 +140,7 @@ def run(
         _warn_of_ranks()
         with _progress(scene, quiet) as observers:
             result = solve(
-                scene, out=out, observers=observers, solver=solver, tolerance=tolerance, goal=cast("Goal", goal)
+                scene, out=out, observers=observers, solver=solver, tolerance=tolerance, goal=cast("Goal", goal or "K")
             )
         if json_file and _rank() == 0:
             _write_json(result, None if to_stdout else json_file)

@@ -140,18 +140,18 @@ def continuous(case: Case, **changes: Any) -> Case:
 
 def solve(case: Case, comm: MPI.Intracomm, stiff_die: bool = False) -> tuple[list[Step], list[tuple[float, float]]]:
     """Steps of a run, and with ``stiff_die`` what an elastic die would change at each, to first order. Collective."""
-    from extrusion.condensed import Condensed, choose
+    from extrusion.condensed import Condensed
     from extrusion.mesh import case_mesh, on_root
     from extrusion.newton import Newton
     from extrusion.problem import Problem
     from extrusion.stepping import steps
 
     problem = Problem(case, on_root(comm, lambda: case_mesh(case.profile, case.mesh_size)), comm)
-    system = Condensed(problem, stiff_die=True) if stiff_die else choose(problem)
+    system = Condensed(problem, stiff_die)
     done, effects = [], []
     for step in steps(system, Newton(system), case.times()):
         done.append(step)
-        if isinstance(system, Condensed) and stiff_die:
+        if stiff_die:
             effects.append(system.die_effect(system.x))
     return done, effects
 

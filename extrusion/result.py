@@ -213,7 +213,7 @@ class Result:
         e = self.estimate
         bars = (["± mm"], ["± kN"]) if e else ([], [])
         header = ["t mm", "u_y(K) mm", *bars[0], *(["sheet mm", "diff. %"] if figures else [])]
-        header += ["reaction kN", *bars[1], "energy J"]
+        header += ["reaction kN", *(bars[1] or ["energy J"])]
         header += [*(f"gap({name}) mm" for name in gaps), "iterations", "cuts"]
         rows = []
         for step in (self.steps[i] for i in chosen):
@@ -223,8 +223,8 @@ class Result:
                 c = figures.get(step.t)
                 row += ["", ""] if c is None else [f"{c.figure.value:.3f}", f"{100 * c.difference:+.3f}"]
             row += [_fixed(step.reaction / 1e3, 2)]
-            row += [f"{e.error.reaction * max(e.reaction_scale, abs(step.reaction)) / 1e3:.1g}"] if e else []
-            row += [_fixed(step.energy / 1e3, 2)]
+            bar = e.error.reaction * max(e.reaction_scale, abs(step.reaction)) / 1e3 if e else 0.0
+            row += [f"{bar:.1g}" if e else _fixed(step.energy / 1e3, 2)]
             row += [_fixed(step.gap[name], 3) for name in gaps]
             rows.append([*row, str(step.iterations), str(step.cuts)])
         return header, rows
