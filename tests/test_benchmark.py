@@ -2,6 +2,7 @@
 
 import statistics
 import time
+from dataclasses import replace
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -11,6 +12,7 @@ import pytest
 from dolfinx.fem.petsc import assemble_matrix
 
 from extrusion.cases import A
+from extrusion.condensed import choose
 from extrusion.mesh import case_mesh
 from extrusion.newton import Newton
 from extrusion.problem import Problem
@@ -56,3 +58,23 @@ def test_case_a_costs_its_linear_algebra(capsys: pytest.CaptureFixture[str]) -> 
         spread = f"{min(ratios[1:]):.2f} to {max(ratios[1:]):.2f}"
         print(f"\nsolve phase of A: {ratio:.2f} times its linear algebra ({spread}; {iterations} iterations)")
     assert ratio < 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "least"), [(4.0, 1.0), (1.0, 2.0)])
+def test_surface_is_quicker(size: float, least: float, capsys: pytest.CaptureFixture[str]) -> None:
+    """A surface solve that factors, pairs or copies more than it saves: ratio of runs in turn, medians of five."""
+    case = replace(A, method="nitsche", order=2, size=size)
+    problem = Problem(case, case_mesh(case.profile, size), MPI.COMM_SELF)
+    seconds: dict[str, list[float]] = {"full": [], "surface": []}
+    for _ in range(5):
+        for solver, spent in seconds.items():
+            started = time.perf_counter()
+            system = choose(problem, solver)
+            for _step in steps(system, Newton(system), case.times()):
+                pass
+            spent.append(time.perf_counter() - started)
+    ratio = statistics.median(f / s for f, s in zip(*seconds.values(), strict=True))
+    with capsys.disabled():
+        print(f"\nfull / surface at {problem.dofs} dofs: {ratio:.2f}")
+    assert ratio >= least
