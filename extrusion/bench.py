@@ -39,7 +39,7 @@ FRONT_TURNS, PAIR_TURNS = 3, 5
 PAIRS = ((4.0, 155.0), (1.0, 155.0), (0.6, 155.0), (0.2, 50.0))
 """Sizes (mm) at which the two solvers are compared, and until which t (mm)."""
 
-GROWTH_SIZES, GROWTH_UNTIL = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125, 0.0625), 20.0
+GROWTH_SIZES, GROWTH_UNTIL = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125, 0.0625), 15.0
 THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 PHASES = ("setup", "factor", "condensation", "steps", "output")
 PRESSURE_AT = 50.0
@@ -230,13 +230,14 @@ def _child(text: str, mesh: str | None = None) -> None:
 
 def machine() -> dict[str, Any]:
     """What the figures were measured on, and when."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    from mpi4py import MPI  # noqa: F401  the wheel's PETSc needs the MPI that it loads
     from petsc4py import PETSc
 
     import dolfinx
 
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return {
         "date": date.today().isoformat(),
         "platform": f"{platform.system()} {platform.machine()}",
@@ -349,7 +350,7 @@ def growth(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     mine = [row for row in rows if row["part"] == "growth" and row["status"] == "converged"]
     if len(mine) < 2:
         return []
-    series = {name: [row[name] for row in mine] for name in (*PHASES, "compliance", "iterations")}
+    series = {name: [row[name] for row in mine] for name in (*PHASES[:-1], "compliance", "iterations")}
     series["steps / iterations"] = [row["steps"] / row["iterations"] for row in mine]
     series["memory - base"] = [row["memory"] - row["base"] for row in mine]
     series["memory_factor - base"] = [row["memory_factor"] - row["base"] for row in mine]
@@ -495,10 +496,14 @@ COLOURS = {"nodal": "#56b4e9", "penalty": "#e69f00", "nitsche": "#0072b2", "mort
 
 
 def draw(rows: Iterable[dict[str, Any]], path: Path) -> None:
-    """Errors of K and of the reaction against seconds of the solve phase, with the best front of each die."""
+    """Errors of K and of the reaction against seconds of the solve phase, with the best front of each die.
+
+    Each die is held against its own reference; an error below the reference's bar counts as the bar in the front.
+    """
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     done = [row for row in rows if row["part"] == "front" and row["status"] == "converged"]
     figure = Figure(figsize=(11, 5), layout="constrained")
@@ -516,9 +521,14 @@ def draw(rows: Iterable[dict[str, Any]], path: Path) -> None:
                     color=colour, mfc=face, ms=7, zorder=2,
                 )  # fmt: skip
         axis.set(xscale="log", yscale="log", xlabel="solve phase, CPU s", ylabel=f"largest relative error of {label}")
-        bar = max((row[f"{name}_bar"] for row in done), default=0.0)
-        axis.axhspan(axis.get_ylim()[0], bar, color="0.88", zorder=0)
+        bar = max((row[f"{name}_bar"] for row in done), default=math.nan)
+        bottom = min(axis.get_ylim()[0], 0.7 * bar)
+        axis.axhspan(bottom, bar, color="0.88", zorder=0)
+        axis.set_ylim(bottom=bottom)
         axis.grid(which="major", color="0.92", zorder=0)
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter(NullFormatter())
     figure.legend(
         handles=[
             *(Line2D([], [], marker="s", ls="", color=colour, label=name) for name, colour in COLOURS.items()),
@@ -526,7 +536,7 @@ def draw(rows: Iterable[dict[str, Any]], path: Path) -> None:
             Line2D([], [], marker="o", ls="", color="0.3", label="P2"),
             Line2D([], [], marker="o", ls="-", color="black", label="elastic die, best front"),
             Line2D([], [], marker="o", mfc="white", ls=":", color="black", label="rigid die, best front"),
-            Patch(color="0.88", label="within the reference's error bar"),
+            Patch(color="0.88", label="below the reference's error bar"),
         ],
         loc="outside upper center",
         ncols=5,

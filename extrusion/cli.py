@@ -106,6 +106,9 @@ def run(
     goal: Annotated[
         str | None, typer.Option(metavar="K|reaction", help="What the tolerance is of; by default K.")
     ] = None,
+    adapt: Annotated[
+        bool, typer.Option("--adapt", help="Refine a mesh where the goal needs it, until it has the tolerance.")
+    ] = False,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for files; by default results/CASE.")] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the result as one JSON object; - is stdout.")
@@ -120,16 +123,16 @@ def run(
     given = {name for name, value in changes.items() if value is not None}
     logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, format="extrusion: %(message)s")
     if not quiet:
-        for name in ("condensed", "estimate"):
+        for name in ("condensed", "estimate", "adapt"):
             logging.getLogger(f"extrusion.{name}").setLevel(logging.INFO)
-    with _as_options(given | {"out", "json", "solver", "tolerance", "goal"}):
+    with _as_options(given | {"out", "json", "solver", "tolerance", "goal", "adapt"}):
         from extrusion.result import changed
         from extrusion.result import run as solve
 
         if goal is not None and tolerance is None:
             raise InputError("goal", goal, "it is what a tolerance is of: give --tolerance too")
         if tolerance is not None:
-            for name in ("method", "order", "size", "mesh", "form", "gamma"):
+            for name in ("method", "order", "size", "mesh", "form", "gamma", "theta"):
                 if name in given:
                     raise InputError(name, changes[name], "leave it out: with --tolerance the model is chosen")
         scene = changed(_load(case), **{**changes, "mesh": str(mesh) if mesh else None})
@@ -140,7 +143,13 @@ def run(
         _warn_of_ranks()
         with _progress(scene, quiet) as observers:
             result = solve(
-                scene, out=out, observers=observers, solver=solver, tolerance=tolerance, goal=cast("Goal", goal or "K")
+                scene,
+                out=out,
+                observers=observers,
+                solver=solver,
+                tolerance=tolerance,
+                goal=cast("Goal", goal or "K"),
+                adapt=adapt,
             )
         if json_file and _rank() == 0:
             _write_json(result, None if to_stdout else json_file)

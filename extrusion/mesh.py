@@ -268,10 +268,22 @@ def graded_mesh(profile: Profile, size: float) -> PlainMesh:
     growth = min(1.5 * math.sqrt(size / profile.radius), 0.5)
     in_billet = [(edges["side"] + edges["front"], size), ((("K", "K"),), 0.15 * size), ((("L", "L"),), 0.05 * size)]
     in_die = [(contact, 2 * size), (tuple((v, v) for _, v in contact), 0.2 * size)]
+    return sized_mesh(profile, _size(profile, in_billet, growth), _size(profile, in_die, 2 * growth))
+
+
+def sized_mesh(
+    profile: Profile, billet: Callable[[float, float], float], die: Callable[[float, float], float]
+) -> PlainMesh:
+    """Mesh of a profile by gmsh, with a given element size at (r, y) in each body, mm.
+
+    Raises:
+        InputError: If gmsh is missing, or cannot mesh the outline.
+    """
     with _gmsh() as gmsh:
-        billet = _triangulate(gmsh, profile, profile.billet_edges, _size(profile, in_billet, growth))
-        die = _triangulate(gmsh, profile, profile.die_edges, _size(profile, in_die, 2 * growth))
-    return _join(billet, die)
+        return _join(
+            _triangulate(gmsh, profile, profile.billet_edges, billet),
+            _triangulate(gmsh, profile, profile.die_edges, die),
+        )
 
 
 def _size(

@@ -274,6 +274,7 @@ def run(
     solver: str = "auto",
     tolerance: float | None = None,
     goal: Goal = "K",
+    adapt: bool = False,
     **changes: Any,
 ) -> Result:
     """Solve a case. Collective.
@@ -289,6 +290,8 @@ def run(
         tolerance: Relative error of the goal for which the cheapest model is chosen (die, order, size, zones), in place
             of the case's own; the result has the `Estimate`.
         goal: "K" (its u_y) or "reaction".
+        adapt: Refine a mesh where the goal needs it until it has the tolerance, in place of choosing a model: P2
+            elements and Nitsche's method, the case's die and zones. Needs gmsh.
         **changes: See `changed`: ``run(cases.A, order=2, method="nitsche", increment=10)``.
 
     Returns:
@@ -315,14 +318,26 @@ def run(
     plain = None if isinstance(mesh, str | Path) else mesh
     case = changed(case, mesh=given, **changes)
     estimate = None
+    if adapt and tolerance is None:
+        raise InputError("adapt", adapt, "give a tolerance too: the mesh is refined until the goal has it")
     if tolerance is not None:
-        chosen = {"mesh": mesh, **{name: changes.get(name) for name in ("method", "order", "size", "form", "gamma")}}
+        chosen = {
+            "mesh": mesh,
+            **{name: changes.get(name) for name in ("method", "order", "size", "form", "gamma", "theta")},
+        }
         for name, value in chosen.items():
             if value is not None:
                 raise InputError(name, value, "leave it out: with a tolerance the model is chosen")
-        from extrusion.estimate import choose_model
+        if adapt:
+            from extrusion.adapt import adapt as adapted
+            from extrusion.estimate import continuous
 
-        case, estimate = choose_model(case, tolerance, goal, comm)
+            plain, estimate = adapted(case, tolerance, goal, comm)
+            case = continuous(case)
+        else:
+            from extrusion.estimate import choose_model
+
+            case, estimate = choose_model(case, tolerance, goal, comm)
     problem = Problem(case, _mesh(comm, case, plain), comm)
     seconds = {"setup": time.perf_counter() - start, "solve": 0.0, "output": 0.0}
     camera = output.Camera(case, PICTURED)
@@ -363,8 +378,13 @@ def run(
         snapshots=camera.snapshots(),
         estimate=estimate,
     )
+    if folder is not None and adapt and plain is not None:
+        from extrusion.mesh import write_mesh
+
+        write_mesh(folder.path / "mesh.msh", plain)  # to run it again with --mesh
     if folder is not None:
-        folder.finish(result, {"mesh": given, "solver": solver, "tolerance": tolerance, **changes})
+        options = {"mesh": given, "solver": solver, "tolerance": tolerance, "adapt": adapt or None}
+        folder.finish(result, {**options, **changes})
     return result
 
 
