@@ -35,7 +35,7 @@ class Newton:
         problem: What is solved.
         atol: Absolute tolerance of the residual, N; not below the round-off of the forces that cancel in it.
         max_iterations: Linear solves before giving up.
-        near: Largest update (mm) after which the second variation is used.
+        near: Largest update (mm) after which the second variation is used; by default half a facet, or the radius / 50.
         predicts: Whether the first linear solve of an increment takes the contact set as it stood in the die.
     """
 
@@ -49,7 +49,8 @@ class Newton:
     ) -> None:
         self.problem, self.atol, self.predicts = problem, atol, predicts
         self._max = max_iterations
-        self._near = 0.02 * problem.case.profile.radius if near is None else near
+        facet = min((float(np.median(term.pair.slave.length)) for term in problem.terms), default=np.inf)
+        self._near = min(0.02 * problem.case.profile.radius, 0.5 * facet) if near is None else near
         self._update, self._fresh = np.inf, False
         self._f = problem.x.duplicate()
         self._trial = problem.x.duplicate()
