@@ -39,7 +39,7 @@ FRONT_TURNS, PAIR_TURNS = 3, 5
 PAIRS = ((4.0, 155.0), (1.0, 155.0), (0.6, 155.0), (0.2, 50.0))
 """Sizes (mm) at which the two solvers are compared, and until which t (mm)."""
 
-GROWTH_SIZES, GROWTH_UNTIL = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125, 0.0625), 15.0
+GROWTH_SIZES, GROWTH_UNTIL = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125, 0.0625), 30.0
 THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 PHASES = ("setup", "factor", "condensation", "steps", "output")
 PRESSURE_AT = 50.0
