@@ -24,7 +24,7 @@ import numpy as np
 from extrusion import run
 from extrusion.cases import Case, Zone
 from extrusion.elasticity import Elastic
-from extrusion.mesh import PlainMesh, plain_mesh
+from extrusion.mesh import PlainMesh, grid, plain_mesh
 from extrusion.problem import Problem
 from extrusion.profile import Profile
 
@@ -36,18 +36,6 @@ TARGET = (T - GAP) / (L / 5000 + H / 8000)  # MPa
 
 
 # %%
-def grid(r: np.ndarray, y: np.ndarray, first: int = 0) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Nodes, triangles and sides of a rectangle cut at r and y, numbered from ``first``."""
-    node = first + np.arange(len(y) * len(r)).reshape(len(y), len(r))
-    a, b, c, d = (n.ravel() for n in (node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]))
-    lines = {"bottom": node[0], "right": node[:, -1], "top": node[-1], "left": node[:, 0]}
-    return (
-        np.stack(np.meshgrid(r, y), axis=-1).reshape(-1, 2),
-        np.vstack([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]),
-        {side: np.stack([line[:-1], line[1:]], axis=1) for side, line in lines.items()},
-    )
-
-
 def scene(slope: float) -> tuple[Case, PlainMesh]:
     """Billet and die, GAP apart on the axis, and their mesh."""
     low, rise = L + GAP, slope * WIDTH

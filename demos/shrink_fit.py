@@ -22,7 +22,7 @@ import numpy as np
 
 from extrusion import run
 from extrusion.cases import STEEL, Case, Zone
-from extrusion.mesh import plain_mesh
+from extrusion.mesh import grid, plain_mesh
 from extrusion.profile import Profile
 
 R0, R1, LENGTH, OVERLAP = 500.0, 1000.0, 6000.0, 2 / 3  # mm
@@ -31,20 +31,7 @@ TARGET = STEEL.E * OVERLAP / R0 * (R1**2 - R0**2) / (2 * R1**2) / (1 + OVERLAP /
 # %% [markdown]
 # Two grids, whose nodes do not match along the contact: 48 elements on the shaft against 36 on the hub.
 
-
 # %%
-def grid(r: np.ndarray, y: np.ndarray, first: int = 0) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Nodes, triangles and sides of a rectangle cut at r and y, numbered from ``first``."""
-    node = first + np.arange(len(y) * len(r)).reshape(len(y), len(r))
-    a, b, c, d = (n.ravel() for n in (node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]))
-    lines = {"bottom": node[0], "right": node[:, -1], "top": node[-1], "left": node[:, 0]}
-    return (
-        np.stack(np.meshgrid(r, y), axis=-1).reshape(-1, 2),
-        np.vstack([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]),
-        {side: np.stack([line[:-1], line[1:]], axis=1) for side, line in lines.items()},
-    )
-
-
 shaft, shaft_cells, around = grid(np.linspace(0, R0 + OVERLAP, 5), np.linspace(0, LENGTH, 49))
 hub, hub_cells, inside = grid(np.geomspace(R0, R1, 7), np.linspace(0, LENGTH, 37), len(shaft))
 mesh = plain_mesh(

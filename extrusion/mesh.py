@@ -247,6 +247,18 @@ def sheet_mesh(profile: Profile) -> PlainMesh:
     return _join(billet, die)
 
 
+def grid(r: Array, y: Array, first: int = 0) -> tuple[Array, Indices, dict[str, Indices]]:
+    """Nodes, triangles and sides (bottom, right, top, left) of a rectangle cut at r and y, numbered from ``first``."""
+    node = first + np.arange(len(y) * len(r)).reshape(len(y), len(r))
+    a, b, c, d = (n.ravel() for n in (node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]))
+    lines = {"bottom": node[0], "right": node[:, -1], "top": node[-1], "left": node[:, 0]}
+    return (
+        np.stack(np.meshgrid(r, y), axis=-1).reshape(-1, 2),
+        np.vstack([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]),
+        {side: np.stack([line[:-1], line[1:]], axis=1) for side, line in lines.items()},
+    )
+
+
 def graded_mesh(profile: Profile, size: float) -> PlainMesh:
     """Mesh of element size h = `size` (mm) that is fine where contact is, by gmsh.
 

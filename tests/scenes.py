@@ -8,7 +8,7 @@ import numpy as np
 
 from extrusion.cases import Case, Zone
 from extrusion.gap import Surface
-from extrusion.mesh import PlainMesh, plain_mesh
+from extrusion.mesh import PlainMesh, grid, plain_mesh
 from extrusion.newton import Newton
 from extrusion.problem import Problem
 from extrusion.profile import Profile
@@ -53,16 +53,6 @@ def block(*, radius: float, length: float, start: float, end: float, divisions: 
     return Profile(
         die=die, bore=("I", "F"), cone=("F", "G"), fixed=(("H", "I"),), radius=radius, length=length, divisions=parts
     )
-
-
-def grid(r: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Nodes, triangles and the edges of the four sides of a rectangle cut at the given r and y."""
-    points = np.stack(np.meshgrid(r, y), axis=-1).reshape(-1, 2)
-    n = np.arange(len(points)).reshape(len(y), len(r))
-    a, b, c, d = n[:-1, :-1].ravel(), n[:-1, 1:].ravel(), n[1:, 1:].ravel(), n[1:, :-1].ravel()
-    cells = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    lines = {"bottom": n[0], "right": n[:, -1], "top": n[-1], "left": n[:, 0]}
-    return points, cells, {name: np.stack([line[:-1], line[1:]], axis=1) for name, line in lines.items()}
 
 
 def billet_mesh(profile: Profile, columns: int, rows: int, die: tuple[int, int] | None = None) -> PlainMesh:
