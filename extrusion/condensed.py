@@ -31,7 +31,7 @@ import scipy.sparse
 
 from extrusion.errors import InputError
 from extrusion.gap import Array, Index
-from extrusion.problem import Problem
+from extrusion.problem import BILLET_POINTS, Problem
 from extrusion.system import System, node_positions
 
 log = logging.getLogger(__name__)
@@ -119,7 +119,6 @@ class Condensed(System):
         self.x = PETSc.Vec().createMPI((size if self.on_root else 0, size), comm=self.comm)
         self._tangent = _Tangent(self)
         self._known: list[tuple[Array, Array]] = []
-        self._last = np.zeros(0), np.zeros(0)
         n = self.x.local_size
         self._A = PETSc.Mat().createPython(((n, size), (n, size)), context=self._tangent, comm=self.comm)
         self._A.setUp()
@@ -139,7 +138,7 @@ class Condensed(System):
         free_of_held = ~np.isin([*places.values()], full.held).reshape(-1, 2)
         watched = np.array([*places.values()], dtype=np.int64).reshape(-1, 2)
         more = np.setdiff1d(watched[free_of_held], dofs)
-        of_billet = {dof for name, pair in places.items() if name in ("K", "L", "M", "N") for dof in pair}
+        of_billet = {dof for name, pair in places.items() if name in BILLET_POINTS for dof in pair}
         bodies = np.concatenate([bodies, np.isin(more, [*of_billet])])
         z_of = np.concatenate([read, np.full(len(more), -1)])
         dofs = np.concatenate([dofs, more])
@@ -154,7 +153,6 @@ class Condensed(System):
         self._row_of_z[first:] = self.n_read + np.arange(self.n_multipliers)
         self._watched = np.where(np.isin(watched, self.dofs), _place_in(self.dofs, watched), -1)
         self._watched_drive = full.drive_at(watched)
-        self._points = [*places]
 
         forced = np.concatenate([term.forced for term in self.terms])
         forced = forced[np.sort(np.unique(forced, return_index=True)[1])]
@@ -341,12 +339,6 @@ class Condensed(System):
         except ArithmeticError:
             out[:] = np.nan
 
-    def contact_forces(self, z: Array) -> Array:
-        """Contact's part of the residual over z, N. The last one is remembered, until the contact state changes."""
-        if self._last[0] is not z:
-            self._last = z, super().contact_forces(z)
-        return self._last[1]
-
     def _out_of_balance(self, x: PETSc.Vec, z: Array) -> Array:
         """The residual's rows of forces and multipliers; on rank 0."""
         R = self.contact_forces(z)
@@ -391,22 +383,6 @@ class Condensed(System):
         t = float(x.array_r[0]) if self.on_root else 0.0
         return self.comm.bcast(t) if self.comm.size > 1 else t
 
-    def start(self, x: PETSc.Vec) -> None:
-        super().start(x)
-        self._last = np.zeros(0), np.zeros(0)
-
-    def expect(self, on: bool) -> bool:
-        self._last = np.zeros(0), np.zeros(0)
-        return super().expect(on)
-
-    def pair_up(self, x: PETSc.Vec, settle: bool = False) -> None:
-        super().pair_up(x, settle)
-        self._last = np.zeros(0), np.zeros(0)
-
-    def accept(self, x: PETSc.Vec) -> None:
-        super().accept(x)
-        self._last = np.zeros(0), np.zeros(0)
-
     # -- reports ---------------------------------------------------------------------------------------------
 
     def reactions(self, x: PETSc.Vec) -> tuple[float, float]:
@@ -432,7 +408,7 @@ class Condensed(System):
             t, f, _ = self._split(x)
             u = np.append(self._displacements(f), 0.0)
             values = t * self._watched_drive + u[self._watched]
-            found = {name: (float(r), float(y)) for name, (r, y) in zip(self._points, values, strict=True)}
+            found = {name: (float(r), float(y)) for name, (r, y) in zip(self._watch, values, strict=True)}
         found = self.comm.bcast(found) if self.comm.size > 1 else found
         assert found is not None
         return {name: found[name] for name in points}

@@ -38,6 +38,9 @@ SAFETY = 32.0
 
 AXIS = {"r": 0, "y": 1}
 
+BILLET_POINTS = ("K", "L", "M", "N")
+"""Named points of the profile that are the billet's corners; the others are the die's."""
+
 
 class Problem(System):
     """One scene, discretised; x holds all displacements (and pressures and multipliers), each rank its own.
@@ -509,7 +512,7 @@ class Problem(System):
         billet = np.isin(np.arange(len(x)), blocks)
         out = {}
         for name, point in self.case.profile.points.items():
-            in_billet = name in ("K", "L", "M", "N")
+            in_billet = name in BILLET_POINTS
             distance = np.linalg.norm(x - point, axis=1)
             distance[billet != in_billet] = np.inf
             best = int(np.argmin(distance)) if len(distance) else -1
