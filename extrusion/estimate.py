@@ -9,8 +9,8 @@ runs that are cheaper than the one in question:
   measures it anew);
 - *order*: the distance of linear to quadratic elements on one of these meshes;
 - *die*: the displacements of an elastic die under the forces of the rigid one, by a back-substitution, and what they do
-  to K and the reaction, by a solve with the tangent (`Condensed.die_effect`): first order; of the effect on K at 4 mm it
-  finds 0.93 to 1.23 up to t = 140 and 0.4 at t = 155, where K has met the tip of the cone;
+  to K and the reaction, by a solve with the tangent (`Condensed.die_effect`): first order. At 4 mm it finds 0.93 to
+  1.23 of the effect on K up to t = 140, and 0.4 of it at t = 155, where K has met the tip of the cone;
 - *zone*: a zone whose gap stays wide open is left out, which changes nothing.
 
 Errors are the largest over all steps: relative of K; of the reaction relative to its size, or to its largest before the
