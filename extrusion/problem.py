@@ -27,9 +27,10 @@ from extrusion.elasticity import epsilon, mixed_virtual_work, quadrature_degree,
 from extrusion.errors import InputError
 from extrusion.gap import Array, Index, Surface, polyline
 from extrusion.mesh import PlainMesh, TaggedMesh, check_profile, distribute, on_root
+from extrusion.pairs import CurvePair
 from extrusion.surfaces import Trace, all_ranks, gather_trace
 from extrusion.system import System
-from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact, Pair
+from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact
 
 log = logging.getLogger(__name__)
 
@@ -221,9 +222,10 @@ class Problem(System):
         ray = (zone.gap or ("closest" if case.method == "nodal" else "ray")) == "ray"
         # past its ends the die goes on straight; but what a glissière without a second zone pushes past F is let go
         extended = zone.contact != "bilateral" or len(case.zones) > 1
-        pair = Pair(
-            zone.name, slave, master, AXIS[zone.ray], sign, zone.contact, ray, zone.smooth, extended, case.axisymmetric
-        )
+        pair = CurvePair(
+            name=zone.name, slave=slave, die=master, axis=AXIS[zone.ray], sign=sign, closure=zone.contact, ray=ray,
+            smooth=zone.smooth, extended=extended, axisymmetric=case.axisymmetric,
+        )  # fmt: skip
         # the displacement form's stress, which Nitsche's term bounds, stiffens towards nu = 1/2; a pressure does not
         nu = material.nu if case.method in ("nitsche", "penalty") and not case.mixed else REFERENCE_NU
         k = stiffness(case.contact_gamma, material.E, nu, slave.length)

@@ -24,7 +24,7 @@ from extrusion import cases
 from extrusion.cases import Case
 
 if TYPE_CHECKING:
-    from extrusion.zones import ContactState
+    from extrusion.pairs import ContactState
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from extrusion.errors import StepError
 from extrusion.newton import Newton
+from extrusion.pairs import ContactState
 from extrusion.system import System
-from extrusion.zones import ContactState
 
 log = logging.getLogger(__name__)
 

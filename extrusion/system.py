@@ -11,7 +11,7 @@ import numpy as np
 
 from extrusion.cases import Case
 from extrusion.gap import Array, Index, Surface
-from extrusion.zones import ContactTerm, MortarContact, gap_at_nodes
+from extrusion.zones import ContactTerm, MortarContact
 
 
 class System(ABC):
@@ -147,7 +147,7 @@ class System(ABC):
         corners = self.case.profile.points
         out: dict[str, float] = {}
         for term in self.terms:
-            nodes, gaps = gap_at_nodes(term.pair, z)
+            nodes, gaps = term.pair.gap_at_nodes(z)
             positions = node_positions(term.pair.slave, nodes)
             for name in ("K", "L", "M"):
                 near = np.linalg.norm(positions - corners[name], axis=1) < 1e-6 * self.case.profile.radius

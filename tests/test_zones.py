@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 from mpi4py import MPI
 
@@ -15,18 +16,16 @@ from dolfinx import fem
 
 from extrusion.cases import A, Case
 from extrusion.contact import CLOSURES, Closure
-from extrusion.gap import polyline
+from extrusion.gap import Surface, polyline
 from extrusion.mesh import case_mesh
+from extrusion.pairs import CurvePair
 from extrusion.problem import Problem
 from extrusion.profile import SSNV504
 from extrusion.zones import (
     ContactTerm,
     IntegratedContact,
     NodalContact,
-    Pair,
     closed_at_start,
-    gap_at_nodes,
-    nodal_weights,
 )
 
 LAWS = [("nodal", 0), ("mortar", 0), ("penalty", 0), ("nitsche", -1), ("nitsche", 0), ("nitsche", 1)]
@@ -37,13 +36,19 @@ LAWS = [("nodal", 0), ("mortar", 0), ("penalty", 0), ("nitsche", -1), ("nitsche"
 #   slave from (0, 0) to (1.5, 2), 2.5 mm long; die r = 0.75 y + gap, parallel to it; k = 100 MPa/mm
 
 
+def between(slave: Surface, die: Surface, **changes: Any) -> CurvePair:
+    """A pair with a radial ray."""
+    options: dict[str, Any] = dict(closure="unilateral", ray=True, smooth=False, extended=True, axisymmetric=False)
+    return CurvePair(name="1", slave=slave, die=die, axis=0, sign=1.0, **{**options, **changes})
+
+
 def facet(
     method: str, ray: bool, closure: Closure = "unilateral", end: float = 9.0, extended: bool = True
 ) -> ContactTerm:
     """The facet's nodes are 0 and 1, the die's 2 and 3, the multipliers stand at 8 and 9."""
     slave = curve(np.array([[0.0, 0.0], [1.5, 2.0]]))
     die = polyline(np.array([[-6.75, -9.0], [0.75 * end, end]]), 2, -1.0)
-    pair = Pair("1", slave, die, 0, 1.0, closure, ray, False, extended, axisymmetric=False)
+    pair = between(slave, die, closure=closure, ray=ray, extended=extended)
     k = np.array([100.0])
     return NodalContact(pair, 8, k, 50.0) if method == "nodal" else IntegratedContact(pair, k, None, 0, 50.0)
 
@@ -180,7 +185,7 @@ def test_checked_contact_reports_and_does_nothing(method: str, order: int) -> No
     assert_allclose(state.gap, -0.1)
     assert_allclose(state.pressure, 0)
     assert state.closed.all()
-    assert_allclose(gap_at_nodes(term.pair, z)[1], -0.1)
+    assert_allclose(term.pair.gap_at_nodes(z)[1], -0.1)
 
 
 @pytest.mark.parametrize(
@@ -194,9 +199,10 @@ def test_checked_contact_reports_and_does_nothing(method: str, order: int) -> No
 )
 def test_nodal_weights(ends: list, order: int, weights: list[float]) -> None:
     """Integral of N 2 pi r ds along a cylinder and over a disc, by hand, in units of pi, in order along the curve."""
-    assert_allclose(nodal_weights(curve(np.array(ends), order), True) / np.pi, weights, atol=1e-12)
+    slave = curve(np.array(ends), order)
+    assert_allclose(between(slave, slave, axisymmetric=True).nodal_weights() / np.pi, weights, atol=1e-12)
     flat = np.array([0.5, 0.5] if order == 1 else [1 / 6, 2 / 3, 1 / 6]) * np.linalg.norm(np.diff(ends, axis=0))
-    assert_allclose(nodal_weights(curve(np.array(ends), order), False), flat)
+    assert_allclose(between(slave, slave).nodal_weights(), flat)
 
 
 # -- the billet in the die -------------------------------------------------------------------------------------
