@@ -95,18 +95,22 @@ class Case:
     name: str
     title: str = ""
     profile: Profile = SSNV504
-    space: Literal["axisymmetric", "plane strain"] = "axisymmetric"  # plane strain: per mm of thickness, half the scene
+    # plane strain: per mm of thickness, half the scene; 3d: a quarter, of which the whole revolution is reported
+    space: Literal["axisymmetric", "plane strain", "3d"] = "axisymmetric"
     billet: Elastic = BILLET
     die_material: Elastic = STEEL
     die: Literal["elastic", "rigid"] = "elastic"
     zones: tuple[Zone, ...]
     method: Method = "nitsche"
     order: Literal[1, 2] = 2
+    element: Literal["lagrange", "serendipity"] = "lagrange"  # serendipity: the 20-node hexahedron
     form: Literal["displacement", "mixed"] | None = None  # of the billet's bulk; None: mixed above MIXED_ABOVE
     gamma: float | None = None  # [-]; None: the method's default
     theta: Literal[-1, 0, 1] = 0  # Nitsche's variant
     size: float | None = None  # mm, on the billet's side; None: the profile's divisions, else radius / 25
     mesh: str | None = None  # mesh file, in place of a mesh of the profile
+    sectors: int | None = None  # in 3D: elements over the quarter turn; None: 10, or about the size
+    off_symmetry: float = 0.0  # mm, by which the billet stands off both its planes of symmetry (3D)
     increments: tuple[tuple[float, float], ...]  # (increment, up to t), mm
     figures: tuple[Figure, ...] = field(default=(), repr=False)
 
@@ -124,7 +128,16 @@ class Case:
         _choice("order", self.order, (1, 2))
         _choice("theta", self.theta, (-1, 0, 1))
         _choice("die", self.die, ("elastic", "rigid"))
-        _choice("space", self.space, ("axisymmetric", "plane strain"))
+        _choice("space", self.space, ("axisymmetric", "plane strain", "3d"))
+        _choice("element", self.element, ("lagrange", "serendipity"))
+        if self.element == "serendipity" and (self.space != "3d" or self.order != 2):
+            raise InputError("element", "serendipity", "is the 20-node hexahedron: needs space = '3d' and order 2")
+        if self.space != "3d":
+            for name in ("sectors", "off_symmetry"):
+                if getattr(self, name):
+                    raise InputError(name, getattr(self, name), "leave it out: it is for space = '3d'")
+        remedy = "give a distance in mm, of either sign"
+        object.__setattr__(self, "off_symmetry", _number("off_symmetry", self.off_symmetry, -math.inf, remedy))
         _choice("form", self.form, ("displacement", "mixed", None))
         if self.form == "mixed" and self.order == 1:
             raise InputError("form", "mixed", "needs order 2 (Taylor-Hood: quadratic displacement, linear pressure)")
@@ -232,12 +245,15 @@ def to_dict(case: Case) -> dict[str, Any]:
         "space": case.space,
         "method": case.method,
         "order": case.order,
+        "element": case.element,
         "form": case.form,
         "die": case.die,
         "theta": case.theta,
         "gamma": case.gamma,
         "size": case.size,
         "mesh": case.mesh,
+        "sectors": case.sectors,
+        "off_symmetry": case.off_symmetry,
         "increments": [list(row) for row in case.increments],
         "materials": {
             "billet": dataclasses.asdict(case.billet),

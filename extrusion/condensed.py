@@ -32,7 +32,7 @@ import scipy.sparse
 from extrusion.errors import InputError
 from extrusion.gap import Array, Index
 from extrusion.problem import BILLET_POINTS, Problem
-from extrusion.system import System, node_positions
+from extrusion.system import System, in_words, node_positions
 
 log = logging.getLogger(__name__)
 
@@ -119,6 +119,7 @@ class Condensed(System):
         self.x = PETSc.Vec().createMPI((size if self.on_root else 0, size), comm=self.comm)
         self._tangent = _Tangent(self)
         self._known: list[tuple[Array, Array]] = []
+        self._placed = 0.0  # 1 once the billet is where it stands at the start
         n = self.x.local_size
         self._A = PETSc.Mat().createPython(((n, size), (n, size)), context=self._tangent, comm=self.comm)
         self._A.setUp()
@@ -129,9 +130,10 @@ class Condensed(System):
         first = self.n_z - self.n_multipliers
         free = full.z_free[:first]
         read = np.flatnonzero(free)
-        n_u = 2 * len(full.z_in_billet)
+        dim = full.dim
+        n_u = dim * len(full.z_in_billet)
         in_billet = np.ones(first, dtype=bool)  # the pressures are the billet's
-        in_billet[:n_u] = np.repeat(full.z_in_billet, 2)
+        in_billet[:n_u] = np.repeat(full.z_in_billet, dim)
         self._watch = full.named_points()
         places = full.places_of(self._watch)  # name -> the two global entries of the full x
         dofs, bodies = full.z_to_x[read], in_billet[read]
@@ -152,7 +154,7 @@ class Condensed(System):
         self._row_of_z[self._z_of] = self._in_z
         self._row_of_z[first:] = self.n_read + np.arange(self.n_multipliers)
         self._watched = np.where(np.isin(watched, self.dofs), _place_in(self.dofs, watched), -1)
-        self._watched_drive = full.drive_at(watched)
+        self._watched_drive, self._watched_start = full.drive_at(watched), full.start_at(watched)
 
         forced = np.concatenate([term.forced for term in self.terms])
         forced = forced[np.sort(np.unique(forced, return_index=True)[1])]
@@ -166,10 +168,11 @@ class Condensed(System):
         self._z_drive = np.zeros(self.n_z)  # d at the entries of z
         self._z_y = [np.zeros(self.n_z, dtype=bool) for _ in range(2)]  # axial entries of billet and die
         y = np.zeros(first, dtype=bool)
-        y[1:n_u:2] = True
+        y[1:n_u:dim] = True
         self._z_y[0][:first] = y & in_billet
         self._z_y[1][:first] = y & ~in_billet
         self._z_drive[self._z_y[0]] = 1.0
+        self._z_start = np.where(full.z_to_x >= 0, full.start_at(full.z_to_x), 0.0)
 
     # -- bulk ------------------------------------------------------------------------------------------------
 
@@ -290,7 +293,7 @@ class Condensed(System):
             if np.array_equal(known, x.array_r):
                 return z
         t, f, multipliers = self._split(x)
-        z = t * self._z_drive
+        z = t * self._z_drive + self._z_start * self._placed
         z[self._z_of] += self._displacements(f)[self._in_z]
         z[self.n_z - self.n_multipliers :] = multipliers
         self._known = [(np.array(x.array_r), z), *self._known[:1]]
@@ -305,6 +308,9 @@ class Condensed(System):
 
     def shift_billet(self, x: PETSc.Vec, dt: float) -> None:
         x.array[:1] += dt
+
+    def place_billet(self, x: PETSc.Vec) -> None:
+        self._placed, self._known = 1.0, []
 
     def largest_displacement(self, x: PETSc.Vec) -> float:
         largest = 0.0
@@ -387,8 +393,10 @@ class Condensed(System):
 
     def reactions(self, x: PETSc.Vec) -> tuple[float, float]:
         R = self.contact_forces(self.gather(x))
-        die = self._z_y[1] if self.case.die == "elastic" else self.full.z_on_rigid_die
-        return float(R[self._z_y[0]].sum()), float(R[die].sum())
+        rear, die = float(R[self._z_y[0]].sum()), float(R[self._z_y[1]].sum())
+        if self.case.die == "rigid":
+            die = -rear
+        return self.full.copies * rear, self.full.copies * die
 
     def energy(self, x: PETSc.Vec) -> float:
         # half of the supports' work less that of the forces on the rest, which are -R
@@ -397,7 +405,7 @@ class Condensed(System):
         free = self.full.z_free.copy()
         free[self.n_z - self.n_multipliers :] = False
         at_rear = R[self._z_y[0] & free].sum()  # K u there
-        return 0.5 * float(self._time(x) * at_rear - z[free] @ R[free])
+        return 0.5 * self.full.copies * float(self._time(x) * at_rear - z[free] @ R[free])
 
     def named_points(self) -> dict[str, tuple[int, int]]:
         return self._watch
@@ -407,7 +415,7 @@ class Condensed(System):
         if self.on_root:
             t, f, _ = self._split(x)
             u = np.append(self._displacements(f), 0.0)
-            values = t * self._watched_drive + u[self._watched]
+            values = t * self._watched_drive + self._placed * self._watched_start + u[self._watched]
             found = {name: (float(r), float(y)) for name, (r, y) in zip(self._watch, values, strict=True)}
         found = self.comm.bcast(found) if self.comm.size > 1 else found
         assert found is not None
@@ -420,14 +428,15 @@ class Condensed(System):
         if self.on_root:
             size = np.nan_to_num(np.abs(f.array_r[1 : 1 + self.n_forces]), nan=np.inf)
             at = int(np.argmax(size)) if len(size) else 0
-            node = int(self.z_forced[at]) // 2
+            dim = self.full.dim
+            node = int(self.z_forced[at]) // dim
             place = "?"
             for term in self.terms:
                 for surface in (term.pair.slave, term.pair.die):
                     if node in surface.nodes:
-                        position = node_positions(surface, np.array([node]))[0] + self._z(x)[2 * node : 2 * node + 2]
-                        place = f"({position[0]:.3f}, {position[1]:.3f})"
-            text = f"{self.zones_of(node)}, (r, y) = {place} mm, out of balance by {size[at]:.3g} N"
+                        u = self._z(x)[dim * node : dim * (node + 1)]
+                        place = in_words(node_positions(surface, np.array([node]))[0] + u)
+            text = f"{self.zones_of(node)}, {place}, out of balance by {size[at]:.3g} N"
         f.destroy()
         return str(self.comm.bcast(text))
 
@@ -612,11 +621,9 @@ class _Tangent:
         self._D = scipy.sparse.coo_array((D.values[on].astype(self._dtype), (r[on], c[on])), shape=shape).tocsr()
 
     def _factor(self, parallel: float) -> None:
-        lead, follower, slope = self._leaders(parallel)
+        lead, self._two, self._follower, self._slope = self._leaders(parallel)
         n, m, n_f = len(lead), len(self._pressures), len(self._forces)
         self._kept = np.concatenate([lead, n_f + np.arange(m)])
-        two = np.flatnonzero(follower >= 0)
-        self._two, self._follower, self._slope = two, follower[two], slope[two]
         self._lead = lead
         self._D_kept = D = self._D[self._kept]
         M = np.zeros((n + m, n + m), dtype=self._dtype)
@@ -626,9 +633,15 @@ class _Tangent:
             place = np.full(n_f, -1)
             place[columns] = np.arange(len(columns))
             mine = np.flatnonzero(of_lead == body)
-            C_E = C[:, place[lead[mine]]]
-            with_two = np.flatnonzero(follower[mine] >= 0)
-            C_E[:, with_two] += slope.astype(self._dtype)[mine[with_two]] * C[:, place[follower[mine[with_two]]]]
+            go = np.flatnonzero(of_lead[self._two] == body)
+            widths = np.ones(len(mine) + len(go), dtype=self._dtype)
+            widths[len(mine) :] = self._slope[go]
+            at = np.concatenate([np.arange(len(mine)), np.searchsorted(mine, self._two[go])])
+            E = scipy.sparse.coo_array(
+                (widths, (np.concatenate([place[lead[mine]], place[self._follower[go]]]), at)),
+                shape=(len(columns), len(mine)),
+            )
+            C_E = (E.T.tocsr() @ C.T).T
             M[:, mine] = D[:, first : first + len(C)] @ C_E
             first += len(C)
         M[n:, :n] *= -1.0
@@ -638,30 +651,29 @@ class _Tangent:
         M[n:, n:] = pressed[n:]
         self._lu = scipy.linalg.lu_factor(M.T, overwrite_a=True, check_finite=False) if n + m else ()
 
-    def _leaders(self, parallel: float) -> tuple[Index, Index, Array]:
-        """Forces that are kept; which one goes with each of them (or -1), and in what proportion."""
+    def _leaders(self, parallel: float) -> tuple[Index, Index, Index, Array]:
+        """Forces that are kept; of those that go with one: its place there, which they are, and in what proportion."""
         system, n_f = self._system, len(self._forces)
         D = self._D[:n_f].copy()
         of_pressure = D.indices >= D.shape[1] - len(self._pressures)
         if of_pressure.any() and self._D[n_f:].nnz:  # by pressures as by displacements, each times a stiffness
             D.data[of_pressure] *= np.max(np.abs(self._D[n_f:].data)) / np.max(np.abs(D.data[of_pressure]))
+        # a node's forces side by side; the one with the largest row leads
+        dim = system.full.dim
         z = system.z_forced[self._forces]
-        order = np.argsort(z)
-        near = order[np.minimum(np.searchsorted(z, z ^ 1, sorter=order), n_f - 1)]
-        other = np.where(z[near] == z ^ 1, near, -1) if n_f else near
+        node = np.where(z < dim * len(system.full.z_in_billet), z // dim, -1 - z)
         square: Array = D.multiply(D).sum(axis=1)
+        order = np.lexsort((z, -square, node))
+        first = np.append(True, np.diff(node[order]) != 0) if n_f else np.zeros(0, dtype=bool)
+        of = order[np.maximum.accumulate(np.where(first, np.arange(n_f), 0))] if n_f else order
+        second, of = order[~first], of[~first]
+        second, of = second[square[of] > 0.0], of[square[of] > 0.0]
+        slope = D[of].multiply(D[second]).sum(axis=1) / square[of]
+        goes = square[second] - slope**2 * square[of] <= np.copysign(parallel**2, parallel) * square[of]
         acts = square > 0.0
-        partner = np.where(other >= 0, square[other], 0.0)
-        first = np.flatnonzero(acts & (other >= 0) & ((square > partner) | ((square == partner) & (z % 2 == 0))))
-        second = other[first]
-        slope = D[first].multiply(D[second]).sum(axis=1) / square[first]
-        goes = square[second] - slope**2 * square[first] <= np.copysign(parallel**2, parallel) * square[first]
-        follower, ratio = np.full(n_f, -1), np.zeros(n_f)
-        follower[first[goes]] = second[goes]
-        ratio[first[goes]] = slope[goes]
         acts[second[goes]] = False
         lead = np.flatnonzero(acts)
-        return lead, follower[lead], ratio[lead]
+        return lead, np.searchsorted(lead, of[goes]), second[goes], slope[goes]
 
     def _image(self, D: Any, f: Array, p: Array) -> Array:
         """Rows of D by the displacements of some forces, and by pressures."""

@@ -7,10 +7,12 @@ r and y are the first two of three orthogonal directions, so strain and stress a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 
+import basix.ufl
 import ufl
 
 from extrusion.errors import InputError
@@ -64,11 +66,25 @@ def sigma(eps: Any, lmbda: Any, mu: Any) -> Any:
     return lmbda * ufl.tr(eps) * ufl.Identity(3) + 2 * mu * eps
 
 
-def virtual_work(u: Any, v: Any, lmbda: Any, mu: Any, dx: Any, axisymmetric: bool = False) -> Any:
-    """Bilinear form ``int sigma(u) : eps(v)``, N mm; over the whole revolution in axisymmetry."""
+def virtual_work(
+    u: Any, v: Any, lmbda: Any, mu: Any, dx: Any, axisymmetric: bool = False, dx_volume: Any = None
+) -> Any:
+    """Bilinear form ``int sigma(u) : eps(v)``, N mm; over the whole revolution in axisymmetry.
+
+    With ``dx_volume``, a measure of lower degree, the term in lambda is taken with that (selective reduced
+    integration): trilinear hexahedra then do not lock as the material becomes incompressible. Malkus, Hughes, CMAME
+    15 (1978) 63, doi:10.1016/0045-7825(78)90005-1.
+    """
     x = ufl.SpatialCoordinate(ufl.domain.extract_unique_domain(u))
-    stress = sigma(epsilon(u, x, axisymmetric), lmbda, mu)
-    return ufl.inner(stress, epsilon(v, x, axisymmetric)) * measure_weight(x, axisymmetric) * dx
+    strain_u, strain_v, weight = (
+        epsilon(u, x, axisymmetric),
+        epsilon(v, x, axisymmetric),
+        measure_weight(x, axisymmetric),
+    )
+    if dx_volume is None:
+        return ufl.inner(sigma(strain_u, lmbda, mu), strain_v) * weight * dx
+    volume = lmbda * ufl.tr(strain_u) * ufl.tr(strain_v) * weight
+    return 2 * mu * ufl.inner(strain_u, strain_v) * weight * dx + volume * dx_volume
 
 
 def mixed_virtual_work(
@@ -98,10 +114,35 @@ def von_mises(stress: Any) -> Any:
     return ufl.sqrt(1.5 * ufl.inner(deviator, deviator))
 
 
-def quadrature_degree(order: int, axisymmetric: bool) -> int:
+def quadrature_degree(order: int, axisymmetric: bool, dim: int = 2) -> int:
     """Degree for the bulk form.
 
     One point in the P1 triangle, as the published SSNV504 results have it; degree 4 for P2, since the hoop
-    term is rational (and a one-point P2 triangle is singular).
+    term is rational (and a one-point P2 triangle is singular). On hexahedra ``order + 1`` Gauss points a direction.
     """
+    if dim == 3:
+        return 2 * order
     return 1 if order == 1 else 4 if axisymmetric else 2 * (order - 1)
+
+
+@cache
+def serendipity() -> Any:
+    """Element of the 20-node hexahedron, whose dofs are the values at its vertices and at the middles of its edges.
+
+    The space is that of Arnold, Awanou, Found. Comput. Math. 11 (2011) 337, doi:10.1007/s10208-011-9087-3, degree 2;
+    basix has it with moments along the edges for dofs, which contact at nodes cannot use.
+    """
+    cell = basix.CellType.hexahedron
+    points, weights = basix.make_quadrature(cell, 6)
+    powers = [p for p in np.ndindex(3, 3, 3) if sum(e for e in p if e > 1) <= 2]
+    monomials = np.array([np.prod(points**p, axis=1) for p in powers])
+    orthonormal = basix.tabulate_polynomials(basix.PolynomialType.legendre, cell, 2, points)
+    span = np.linalg.qr(((monomials * weights) @ orthonormal.T).T)[0].T
+    vertices, topology = np.array(basix.geometry(cell)), basix.topology(cell)
+    none = np.zeros((0, 3)), np.zeros((0, 1, 0, 1))
+    nodes = [[(vertices[v].mean(axis=0)[None], np.ones((1, 1, 1, 1))) for v in topology[d]] for d in (0, 1)]
+    nodes += [[none for _ in topology[d]] for d in (2, 3)]
+    x, M = ([[entity[i] for entity in entities] for entities in nodes] for i in (0, 1))
+    return basix.ufl.custom_element(
+        cell, [], np.ascontiguousarray(span), x, M, 0, basix.MapType.identity, basix.SobolevSpace.H1, False, 1, 2
+    )

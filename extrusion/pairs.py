@@ -359,14 +359,14 @@ def _even(z: Array) -> Array:
     return z[: len(z) - len(z) % 2]
 
 
-def take(points: Points, on: np.ndarray) -> Points:
+def take[P: Points](points: P, on: np.ndarray) -> P:
     """Some of the pieces."""
     values = {name: value[on] if isinstance(value, np.ndarray) else value for name, value in vars(points).items()}
     values["curvature"] = tuple((a[on], b[on]) for a, b in points.curvature)
     return type(points)(**values)
 
 
-def widened(points: Points, cols: Index) -> Points:
+def widened[P: Points](points: P, cols: Index) -> P:
     """The points with further local columns, on which gap and weights do not depend."""
 
     def wide(rows: Array | None) -> Array | None:

@@ -11,26 +11,41 @@ from __future__ import annotations
 import logging
 from functools import cached_property
 from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
 
+import basix.ufl
 import dolfinx.fem.petsc
 import ufl
 from dolfinx import fem
 
 from extrusion.cases import LOCKING_FROM, Case, Zone
 from extrusion.contact import REFERENCE_NU, stiffness
-from extrusion.elasticity import epsilon, mixed_virtual_work, quadrature_degree, sigma, virtual_work, von_mises
+from extrusion.elasticity import (
+    epsilon,
+    mixed_virtual_work,
+    quadrature_degree,
+    serendipity,
+    sigma,
+    virtual_work,
+    von_mises,
+)
 from extrusion.errors import InputError
-from extrusion.gap import Array, Index, Surface, polyline
+from extrusion.gap import Array, Index, polyline
+from extrusion.gap3d import Revolved
 from extrusion.mesh import PlainMesh, TaggedMesh, check_profile, distribute, on_root
-from extrusion.pairs import CurvePair
-from extrusion.surfaces import Trace, all_ranks, gather_trace
-from extrusion.system import System
+from extrusion.pairs import CurvePair, Pair
+from extrusion.pairs3d import COPIES, SurfacePair
+from extrusion.surfaces import FaceTrace, Trace, all_ranks, gather_faces, gather_trace
+from extrusion.system import System, in_words
 from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact
+
+if TYPE_CHECKING:
+    from extrusion.mesh3d import HexMesh
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +53,9 @@ SAFETY = 32.0
 """How far below the symmetric method's coercive gamma the unsymmetric one (theta = 0) may go."""
 
 AXIS = {"r": 0, "y": 1}
+
+PLANES = {2: {"axis": 0, "die_axis": 0}, 3: {"billet_x": 0, "billet_z": 2, "die_x": 0, "die_z": 2}}
+"""Facet groups on the axis, or on planes of symmetry, and the component of the displacement that is held there."""
 
 BILLET_POINTS = ("K", "L", "M", "N")
 """Named points of the profile that are the billet's corners; the others are the die's."""
@@ -52,18 +70,24 @@ class Problem(System):
         comm: Ranks that share it.
     """
 
-    def __init__(self, case: Case, mesh: PlainMesh | None, comm: MPI.Intracomm = MPI.COMM_WORLD) -> None:
+    def __init__(self, case: Case, mesh: PlainMesh | HexMesh | None, comm: MPI.Intracomm = MPI.COMM_WORLD) -> None:
         self.case, self.comm = case, comm
         if case.order == 1 and case.billet.nu >= LOCKING_FROM and case.method != "nodal" and comm.rank == 0:
             log.warning(
                 "order = 1 at nu = %g: linear triangles lock: pressure and reaction are far off, use order 2",
                 case.billet.nu,
             )
-        on_root(comm, lambda: check_profile(mesh, case.profile) if mesh else None)
         bodies = ("billet", "die") if case.die == "elastic" else ("billet",)
-        self.tagged: TaggedMesh = distribute(comm, mesh, bodies)
+        self.tagged: TaggedMesh = _distributed(case, mesh, comm, bodies)
         self.bodies = bodies
-        self.V = fem.functionspace(self.tagged.msh, ("Lagrange", case.order, (2,)))
+        self.dim = self.tagged.msh.topology.dim
+        self.copies = 1 if self.dim == 2 else COPIES
+        element = serendipity() if case.element == "serendipity" else None
+        shape = (self.dim,)
+        self.V = fem.functionspace(
+            self.tagged.msh,
+            ("Lagrange", case.order, shape) if element is None else basix.ufl.blocked_element(element, shape=shape),
+        )
         self.Q = fem.functionspace(self.tagged.msh, ("Lagrange", 1)) if case.mixed else None
         self._materials = {"billet": case.billet, "die": case.die_material}
         self._assemble_bulk()
@@ -77,8 +101,10 @@ class Problem(System):
 
     def _assemble_bulk(self) -> None:
         msh, groups = self.tagged.msh, self.tagged.groups
-        degree = quadrature_degree(self.case.order, axisymmetric=self.case.axisymmetric)
+        degree = quadrature_degree(self.case.order, self.case.axisymmetric, self.dim)
         dx = ufl.Measure("dx", msh, subdomain_data=self.tagged.cell_tags, metadata={"quadrature_degree": degree})
+        low = self.dim == 3 and self.case.order == 1  # trilinear: volume changes at the middle of the cell only
+        middle = dx(metadata={"quadrature_degree": 0}) if low else None
         u, v = ufl.TrialFunction(self.V), ufl.TestFunction(self.V)
         form: ufl.Form = 0
         blocks: list[list[ufl.Form]] = []
@@ -91,7 +117,8 @@ class Problem(System):
                 blocks = mixed_virtual_work(u, p, v, q, lmbda, mu, measure, axisymmetric=self.case.axisymmetric)
                 form += blocks[0][0]
             else:
-                form += virtual_work(u, v, lmbda, mu, measure, axisymmetric=self.case.axisymmetric)
+                at_middle = middle(groups[body]) if middle is not None else None
+                form += virtual_work(u, v, lmbda, mu, measure, self.case.axisymmetric, at_middle)
         if blocks:
             blocks[0][0] = form
         self._bulk_form = fem.form(blocks or form)
@@ -129,22 +156,23 @@ class Problem(System):
         if number is None:
             return np.zeros(0, dtype=np.int32)
         msh = self.tagged.msh
-        msh.topology.create_connectivity(1, 2)
-        return fem.locate_dofs_topological(self.V, 1, self.tagged.facet_tags.find(number))
+        msh.topology.create_connectivity(self.dim - 1, self.dim)
+        return fem.locate_dofs_topological(self.V, self.dim - 1, self.tagged.facet_tags.find(number))
 
     def _find_supports(self) -> None:
-        rear, axis, clamped = (self._dofs_on(group) for group in ("rear", "axis", "fixed"))
-        on_die_axis = self._dofs_on("die_axis")
-        index_map = self.V.dofmap.index_map
-        self._owned = 2 * index_map.size_local
+        rear, clamped = self._dofs_on("rear"), self._dofs_on("fixed")
+        index_map, dim = self.V.dofmap.index_map, self.dim
+        self._owned = dim * index_map.size_local
 
         def own(blocks: np.ndarray, component: int) -> np.ndarray:
-            dofs = 2 * blocks.astype(np.int64) + component
+            dofs = dim * blocks.astype(np.int64) + component
             return np.unique(dofs[dofs < self._owned])
 
-        self._driven = own(rear, 1)
-        self._clamped = np.concatenate([own(clamped, 0), own(clamped, 1)])
-        held = [self._driven, self._clamped, own(axis, 0), own(on_die_axis, 0)]
+        self._driven, self._clamped_y = own(rear, 1), own(clamped, 1)
+        planes = {group: own(self._dofs_on(group), component) for group, component in PLANES[dim].items()}
+        none = np.zeros(0, dtype=np.int64)
+        self._shifted = np.concatenate([none, *(dofs for group, dofs in planes.items() if group.startswith("billet_"))])
+        held = [self._driven, *(own(clamped, i) for i in range(dim)), *planes.values()]
         self._n_pressures = self._free_pressures = 0
         if self.Q is not None:  # the die has none
             self._n_pressures = self.Q.dofmap.index_map.size_local
@@ -152,9 +180,12 @@ class Problem(System):
             held.append(self._owned + np.setdiff1d(np.arange(self._n_pressures), billet))
             self._free_pressures = self._n_pressures - len(held[-1])
         self._held = np.unique(np.concatenate(held))
-        self._first_dof = 2 * index_map.local_range[0]
+        self._first_dof = dim * index_map.local_range[0]
         self._first_pressure = self.Q.dofmap.index_map.local_range[0] if self.Q is not None else 0
-        self._billet_y = own(self._blocks_of("billet"), 1)
+        billet_blocks = self._blocks_of("billet")
+        self._billet_y = own(billet_blocks, 1)
+        across = [own(billet_blocks, i) for i in (0, 2)] if self.case.off_symmetry else [none]
+        self._billet_across = np.concatenate(across)
         if self.comm.allreduce(len(self._driven)) == 0:
             raise InputError("mesh", "rear", "the group of the pushed face has no facets")
 
@@ -166,12 +197,13 @@ class Problem(System):
 
     def _gather_contact(self) -> None:
         case, profile = self.case, self.case.profile
-        traces: dict[str, Trace] = {}
+        traces: dict[str, Trace | FaceTrace] = {}
         for zone in case.zones:
             for group in (zone.billet, *((zone.die,) if case.die == "elastic" else ())):
                 facets = self.tagged.facet_tags.find(self.tagged.groups[group])
                 try:
-                    traces[group] = gather_trace(self.V, facets, 1 - AXIS[zone.ray], self.Q)
+                    gather = gather_trace if self.dim == 2 else gather_faces
+                    traces[group] = gather(self.V, facets, 1 - AXIS[zone.ray], self.Q)
                 except ValueError as error:
                     raise InputError("mesh", group, str(error)) from None
         needs_cells = {zone.billet if zone.slave == "billet" else zone.die for zone in case.zones}
@@ -180,7 +212,7 @@ class Problem(System):
         live = [trace.cell_nodes if g in needs_cells else trace.nodes for g, trace in traces.items()]
         self._live = np.unique(np.concatenate([nodes.ravel() for nodes in live]))
         n = len(self._live)
-        surfaces: dict[str, Surface] = {}
+        surfaces: dict[str, Any] = {}
         if case.die == "rigid":
             for zone in case.zones:
                 names = profile.bore if zone.die == "bore" else profile.cone
@@ -191,6 +223,9 @@ class Problem(System):
                 side = float(np.sign(np.dot([t[1], -t[0]], profile.normals(names)[0])))
                 if curve[-1, base] < curve[0, base]:
                     curve, side = curve[::-1], -side
+                if self.dim == 3:
+                    surfaces[zone.die] = Revolved(curve, side)
+                    continue
                 surfaces[zone.die] = polyline(curve, n, side)
                 n += len(curve)
         self._n_nodes = n
@@ -203,17 +238,17 @@ class Problem(System):
         for group, trace in traces.items():
             cols = None
             if group in with_pressure:
-                cols = 2 * n + np.searchsorted(self._live_pressures, trace.pressures)
+                cols = self.dim * n + np.searchsorted(self._live_pressures, trace.pressures)
             surfaces[group] = trace.surface(self._live, group in needs_cells, cols)
         self.terms: list[ContactTerm] = []
-        self._first_multiplier = first = 2 * n + len(self._live_pressures)
+        self._first_multiplier = first = self.dim * n + len(self._live_pressures)
         for zone in case.zones:
             term = self._term(zone, surfaces, first)
             first += term.multipliers
             self.terms.append(term)
         self.n_multipliers = first - self._first_multiplier
 
-    def _term(self, zone: Zone, surfaces: dict[str, Surface], first: int) -> ContactTerm:
+    def _term(self, zone: Zone, surfaces: dict[str, Any], first: int) -> ContactTerm:
         case = self.case
         slave, master = surfaces[zone.billet], surfaces[zone.die]
         material, sign = case.billet, 1.0
@@ -222,13 +257,16 @@ class Problem(System):
         ray = (zone.gap or ("closest" if case.method == "nodal" else "ray")) == "ray"
         # past its ends the die goes on straight; but what a glissière without a second zone pushes past F is let go
         extended = zone.contact != "bilateral" or len(case.zones) > 1
-        pair = CurvePair(
+        common: dict[str, Any] = dict(
             name=zone.name, slave=slave, die=master, axis=AXIS[zone.ray], sign=sign, closure=zone.contact, ray=ray,
-            smooth=zone.smooth, extended=extended, axisymmetric=case.axisymmetric,
+            smooth=zone.smooth, extended=extended,
         )  # fmt: skip
+        pair: Pair = SurfacePair(**common)
+        if self.dim == 2:
+            pair = CurvePair(**common, axisymmetric=case.axisymmetric)
         # the displacement form's stress, which Nitsche's term bounds, stiffens towards nu = 1/2; a pressure does not
         nu = material.nu if case.method in ("nitsche", "penalty") and not case.mixed else REFERENCE_NU
-        k = stiffness(case.contact_gamma, material.E, nu, slave.length)
+        k = stiffness(case.contact_gamma, material.E, nu, pair.lengths)
         rest: tuple[float, bool] = (case.profile.radius, zone.initial == "interpenetrating")
         if case.method == "nodal":
             return NodalContact(pair, first, k, *rest)
@@ -251,13 +289,13 @@ class Problem(System):
             rank = np.searchsorted(starts[:, space], dofs, side="right") - 1
             return np.asarray(dofs - starts[rank, space] + starts[rank, 2] + (starts[rank, 3] if space else 0))
 
-        live = in_x((2 * self._live[:, None] + np.arange(2)).ravel(), 0)
+        live = in_x((self.dim * self._live[:, None] + np.arange(self.dim)).ravel(), 0)
         pressures = in_x(self._live_pressures, 1)
         multipliers = self.n - self.n_multipliers + np.arange(self.n_multipliers)
         self.n_z = self._first_multiplier + self.n_multipliers
         self.z_to_x = np.full(self.n_z, -1, dtype=np.int64)
         self.z_to_x[: len(live)] = live
-        self.z_to_x[2 * self._n_nodes :] = np.concatenate([pressures, multipliers])
+        self.z_to_x[self.dim * self._n_nodes :] = np.concatenate([pressures, multipliers])
         taken = self.z_to_x[self.z_to_x >= 0].astype(PETSc.IntType)
         self._z_live = np.flatnonzero(self.z_to_x >= 0)
         source = PETSc.IS().createGeneral(taken, comm=PETSc.COMM_SELF)
@@ -286,11 +324,16 @@ class Problem(System):
         """Set the supports' values at rear displacement t, mm."""
         values = x.array
         values[self._held] = 0.0
+        values[self._shifted] = -self.case.off_symmetry
         values[self._driven] = t
 
     def shift_billet(self, x: PETSc.Vec, dt: float) -> None:
         """Move the whole billet along y by dt, mm."""
         x.array[self._billet_y] += dt
+
+    def place_billet(self, x: PETSc.Vec) -> None:
+        """Move the whole billet across the axis by what it stands off its planes of symmetry."""
+        x.array[self._billet_across] -= self.case.off_symmetry
 
     # -- what the condensed problem asks ---------------------------------------------------------------------
 
@@ -303,8 +346,8 @@ class Problem(System):
         A = self._tangent.fill(none, none, np.zeros(0))
         of_billet = np.zeros(self.n_local, dtype=bool)
         blocks = self._blocks_of("billet")
-        blocks = blocks[blocks < self._owned // 2]
-        of_billet[np.concatenate([2 * blocks, 2 * blocks + 1])] = True
+        blocks = blocks[blocks < self._owned // self.dim]
+        of_billet[(self.dim * blocks[:, None].astype(np.int64) + np.arange(self.dim)).ravel()] = True
         of_billet[self._owned : self._owned + self._n_pressures] = True
         last = self.comm.rank == self.comm.size - 1
         unknown = np.arange(self.n_local) < self.n_local - (self.n_multipliers if last else 0)
@@ -319,27 +362,27 @@ class Problem(System):
     def places_of(self, points: dict[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
         """Global entries of x that hold the displacement of points given by rank and local block."""
         first = self.comm.allgather(self._row0)
-        return {name: (first[rank] + 2 * block, first[rank] + 2 * block + 1) for name, (rank, block) in points.items()}
+        at = {name: first[rank] + self.dim * block for name, (rank, block) in points.items()}
+        return {name: (entry, entry + 1) for name, entry in at.items()}
 
     def drive_at(self, entries: Index) -> Array:
         """What entries of x are when the billet is moved along y by 1."""
         moved = all_ranks(self.comm, self._billet_y + self._row0)
         return np.isin(entries, moved).astype(float)
 
+    def start_at(self, entries: Index) -> Array:
+        """What entries of x are when the billet is where `place_billet` puts it."""
+        moved = all_ranks(self.comm, self._billet_across + self._row0)
+        return np.where(np.isin(entries, moved), -self.case.off_symmetry, 0.0)
+
     def set_displacements(self, values: Array, t: float, multipliers: Array) -> None:
         """Set x to this rank's values with the billet moved along y by t; the supports take their values."""
         self.x.array[:] = values
+        self.place_billet(self.x)
         self.shift_billet(self.x, t)
         self.drive(self.x, t)
         if self.comm.rank == self.comm.size - 1:
             self.x.array[self.n_local - self.n_multipliers :] = multipliers
-
-    @property
-    def z_on_rigid_die(self) -> np.ndarray:
-        """Axial entries of z on a rigid die."""
-        on = np.zeros(self.n_z, dtype=bool)
-        on[2 * len(self._live) + 1 : 2 * self._n_nodes : 2] = True
-        return on
 
     # -- residual and tangent --------------------------------------------------------------------------------
 
@@ -489,15 +532,18 @@ class Problem(System):
         Both are positive in +y; they balance. A rigid die is its own support.
         """
         f = self.forces(x)
-        rear = float(f.array_r[self._driven].sum())
-        clamped_y = self._clamped[self._clamped % 2 == 1]
-        die = float(f.array_r[clamped_y].sum())
+        rear, die = float(f.array_r[self._driven].sum()), float(f.array_r[self._clamped_y].sum())
         f.destroy()
         rear, die = self.comm.allreduce(rear), self.comm.allreduce(die)
         if self.case.die == "rigid":
-            R = self.contact_forces(self.gather(x))
-            die = float(R[self.z_on_rigid_die].sum())
-        return rear, die
+            die = self.rigid_die_reaction(self.gather(x))
+        return self.copies * rear, self.copies * die
+
+    def rigid_die_reaction(self, z: Array) -> float:
+        """Axial force of the supports on a rigid die, N: minus that of contact on the billet."""
+        axial = np.zeros(self.n_z, dtype=bool)
+        axial[1 : self.dim * len(self._live) : self.dim] = True
+        return -float(self.contact_forces(z)[axial].sum())
 
     def energy(self, x: PETSc.Vec) -> float:
         """Elastic energy of both bodies, N mm, whole revolution."""
@@ -505,17 +551,17 @@ class Problem(System):
         self._K_wide.mult(x, f)
         energy = 0.5 * float(x.dot(f))
         f.destroy()
-        return energy
+        return self.copies * energy
 
     def named_points(self) -> dict[str, tuple[int, int]]:
         """Rank and local dof block of each named point of the profile that is a node of the mesh."""
-        x = self.V.tabulate_dof_coordinates()[: self._owned // 2, :2]
+        x = self.V.tabulate_dof_coordinates()[: self._owned // self.dim]
         blocks = self._blocks_of("billet")
         billet = np.isin(np.arange(len(x)), blocks)
         out = {}
         for name, point in self.case.profile.points.items():
             in_billet = name in BILLET_POINTS
-            distance = np.linalg.norm(x - point, axis=1)
+            distance = np.linalg.norm(x - (*point, 0.0), axis=1)
             distance[billet != in_billet] = np.inf
             best = int(np.argmin(distance)) if len(distance) else -1
             mine = float(distance[best]) if best >= 0 else np.inf
@@ -527,7 +573,7 @@ class Problem(System):
     def point_displacements(self, x: PETSc.Vec, points: dict[str, tuple[int, int]]) -> dict[str, tuple[float, float]]:
         """Displacement (u_r, u_y) of named points, mm."""
         mine = {
-            name: (float(x.array_r[2 * block]), float(x.array_r[2 * block + 1]))
+            name: (float(x.array_r[self.dim * block]), float(x.array_r[self.dim * block + 1]))
             for name, (rank, block) in points.items()
             if rank == self.comm.rank
         }
@@ -544,16 +590,38 @@ class Problem(System):
         largest, rank = self.comm.allreduce((float(size[at]) if len(size) else -1.0, self.comm.rank), op=MPI.MAXLOC)
         text = None
         if rank == self.comm.rank:
-            block = at // 2
-            place = self.V.tabulate_dof_coordinates()[block, :2] + x.array_r[2 * block : 2 * block + 2]
-            where = self.zones_of(int(np.searchsorted(self._live, block + self._first_dof // 2)))
-            text = f"{where}, (r, y) = ({place[0]:.3f}, {place[1]:.3f}) mm, out of balance by {largest:.3g} N"
+            dim = self.dim
+            block = at // dim
+            place = self.V.tabulate_dof_coordinates()[block, :dim] + x.array_r[dim * block : dim * block + dim]
+            where = self.zones_of(int(np.searchsorted(self._live, block + self._first_dof // dim)))
+            text = f"{where}, {in_words(place)}, out of balance by {largest:.3g} N"
         return str(self.comm.bcast(text, root=rank))
 
     @property
     def dofs(self) -> int:
         """Unknowns: displacements of both bodies, fixed ones included, and multipliers."""
         return self.n
+
+
+def _distributed(case: Case, mesh: PlainMesh | HexMesh | None, comm: MPI.Intracomm, bodies: Any) -> TaggedMesh:
+    in_space = case.space == "3d"
+
+    def check() -> None:
+        if mesh is not None and isinstance(mesh, PlainMesh) is in_space:
+            raise InputError("mesh", "triangles" if in_space else "hexahedra", f"does not suit space = {case.space!r}")
+        if isinstance(mesh, PlainMesh):
+            check_profile(mesh, case.profile)
+        elif mesh is not None:
+            from extrusion.mesh3d import check_hex_profile
+
+            check_hex_profile(mesh, case.profile)
+
+    on_root(comm, check)
+    if in_space:
+        from extrusion.mesh3d import distribute_hex
+
+        return distribute_hex(comm, mesh, bodies)  # type: ignore[arg-type]
+    return distribute(comm, mesh, bodies)  # type: ignore[arg-type]
 
 
 class TangentMatrix:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from extrusion.estimate import Estimate, Goal
     from extrusion.mesh import PlainMesh
+    from extrusion.mesh3d import HexMesh
     from extrusion.problem import Problem
     from extrusion.stepping import Step
 
@@ -267,7 +268,7 @@ def changed(case: Case, **changes: Any) -> Case:
 def run(
     case: Case,
     *,
-    mesh: str | Path | PlainMesh | None = None,
+    mesh: str | Path | PlainMesh | HexMesh | None = None,
     comm: MPI.Intracomm | None = None,
     observers: Sequence[Observer] = (),
     out: str | Path | None = None,
@@ -403,17 +404,26 @@ def _figure(figure: Figure, step: Step) -> float:
     return step.points[figure.point][1]
 
 
-def _mesh(comm: MPI.Intracomm, case: Case, given: PlainMesh | None) -> PlainMesh | None:
+def _mesh(comm: MPI.Intracomm, case: Case, given: PlainMesh | HexMesh | None) -> PlainMesh | HexMesh | None:
     """The mesh on rank 0, with every group that the case asks for; None elsewhere."""
     from extrusion.mesh import case_mesh, on_root, read_mesh
 
-    groups = ["billet", "rear", "axis", *(zone.billet for zone in case.zones)]
+    in_space = case.space == "3d"
+    supports = ("billet_x", "billet_z") if in_space else ("axis",)
+    groups = ["billet", "rear", *supports, *(zone.billet for zone in case.zones)]
     if case.die == "elastic":
         groups += ["die", "fixed", *(zone.die for zone in case.zones)]
 
-    def make() -> PlainMesh:
+    def make() -> PlainMesh | HexMesh:
+        mesh: PlainMesh | HexMesh
         if given is not None:
             mesh = given
+        elif in_space:
+            from extrusion.mesh3d import hex_mesh, read_hex
+
+            if case.mesh is not None:
+                return read_hex(case.mesh, groups)
+            mesh = hex_mesh(case.profile, case.mesh_size, case.sectors, case.order)
         elif case.mesh is not None:
             return read_mesh(case.mesh, groups)
         else:

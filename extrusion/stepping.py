@@ -70,6 +70,7 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
     x, accepted = problem.x, problem.x.duplicate()
     x.set(0.0)
     problem.start(x)
+    problem.place_billet(x)
     caught = _caught(problem, 0.0)
     points = problem.named_points()
     t, rate = 0.0, x.duplicate()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -10,7 +11,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from extrusion.cases import Case
-from extrusion.gap import Array, Index, Surface
+from extrusion.gap import Array, Index
 from extrusion.zones import ContactTerm, MortarContact
 
 
@@ -41,6 +42,10 @@ class System(ABC):
     @abstractmethod
     def shift_billet(self, x: PETSc.Vec, dt: float) -> None:
         """Move the whole billet along y by dt, mm."""
+
+    @abstractmethod
+    def place_billet(self, x: PETSc.Vec) -> None:
+        """Move the billet to where it stands at the start (`Case.off_symmetry`)."""
 
     @abstractmethod
     def largest_displacement(self, x: PETSc.Vec) -> float:
@@ -150,7 +155,8 @@ class System(ABC):
             nodes, gaps = term.pair.gap_at_nodes(z)
             positions = node_positions(term.pair.slave, nodes)
             for name in ("K", "L", "M"):
-                near = np.linalg.norm(positions - corners[name], axis=1) < 1e-6 * self.case.profile.radius
+                corner = np.append(corners[name], 0.0)[: positions.shape[1]]
+                near = np.linalg.norm(positions - corner, axis=1) < 1e-6 * self.case.profile.radius
                 if near.any() and name not in out:
                     out[name] = float(gaps[near][0])
         return out
@@ -161,7 +167,13 @@ class System(ABC):
         return f"zone {' and '.join(zones)}" if zones else "away from the zones"
 
 
-def node_positions(surface: Surface, nodes: Index) -> Array:
-    """Reference positions of some nodes of a surface, ``shape=(n, 2)``, mm."""
+def node_positions(surface: Any, nodes: Index) -> Array:
+    """Reference positions of some nodes of a surface, ``shape=(n, dim)``, mm."""
     number, first = np.unique(surface.nodes, return_index=True)
-    return np.asarray(surface.X.reshape(-1, 2)[first[np.searchsorted(number, nodes)]])
+    return np.asarray(surface.X.reshape(-1, surface.X.shape[-1])[first[np.searchsorted(number, nodes)]])
+
+
+def in_words(place: Array) -> str:
+    """A place in the (r, y) half-plane or in space."""
+    axes = "(r, y)" if len(place) == 2 else "(x, y, z)"
+    return f"{axes} = ({', '.join(f'{value:.3f}' for value in place)}) mm"
