@@ -532,7 +532,8 @@ class _Rings:
 
 
 def scattered_points(
-    slave: Facets, die: Facets | Revolved, z: Array, axis: int, sign: float, order: int, ray: bool, smooth: bool
+    slave: Facets, die: Facets | Revolved, z: Array, axis: int, sign: float, order: int, ray: bool, smooth: bool,
+    keep: Index | None = None,
 ) -> SurfacePoints:
     """Integration points at fixed places of the slave's facets, each a piece of its own, with what they face.
 
@@ -556,7 +557,7 @@ def scattered_points(
         middle = np.einsum("qk,mki->mqi", shape_st, slave.X).reshape(-1, 3)
         N = sign * (radial(middle) if axis == 0 else np.broadcast_to([0.0, 1.0, 0.0], middle.shape))
         direction = N[:, None]
-        number, met, past = meet(die, z, x, middle, N, axis)
+        number, met, past = meet(die, z, x, middle, N, axis, keep)
         alpha, M, gap = met.alpha, met.M, met.gap
         die_nodes = die.nodes[number] if isinstance(die, Facets) else _none(number)
         rows = _Rows(slave, facet, die_nodes)
@@ -580,8 +581,12 @@ def scattered_points(
     )  # fmt: skip
 
 
-def meet(die: Facets | Revolved, z: Array, x: Array, X: Array, N: Array, axis: int) -> tuple[Index, _Met, np.ndarray]:
+def meet(
+    die: Facets | Revolved, z: Array, x: Array, X: Array, N: Array, axis: int, keep: Index | None = None
+) -> tuple[Index, _Met, np.ndarray]:
     """Where rays from points x (at X in the reference position) meet the die, on which facet, and which its extension.
+
+    Axial rays stay with the facets ``keep`` as long as they pass these by less than `HELD`.
 
     Raises:
         ArithmeticError: A ray does not meet it.
@@ -593,11 +598,15 @@ def meet(die: Facets | Revolved, z: Array, x: Array, X: Array, N: Array, axis: i
         past = (p < base[0]) | (p > base[-1])
         return number, _meet_revolved(die, number, x[:, None], N[:, None], axis), past
     if axis == 1:
-        return _seek(die, z, x, N)
+        return _seek(die, z, x, N, keep)
     rings = _Rings(die, z, X)
     opposite = (rings.p <= p[:, None]).sum(axis=1) - 1
     met, number, past = rings.meet(np.arange(len(x)), opposite, x[:, None], N[:, None])
     return number, met, past
+
+
+HELD = 0.25
+"""How far past its facet, relative to it, a ray may meet the die and stay with that facet (the facet goes on)."""
 
 
 def _near(die: Facets, xd: Array, x: Array, across: Array | None = None) -> Index:
@@ -609,7 +618,7 @@ def _near(die: Facets, xd: Array, x: Array, across: Array | None = None) -> Inde
     return np.asarray(scipy.spatial.cKDTree(middle).query(x, k=c)[1], dtype=np.int64).reshape(len(x), c)
 
 
-def _seek(die: Facets, z: Array, x: Array, N: Array) -> tuple[Index, _Met, np.ndarray]:
+def _seek(die: Facets, z: Array, x: Array, N: Array, keep: Index | None = None) -> tuple[Index, _Met, np.ndarray]:
     """Facet that the ray along the axis from each point meets; past the surface's rim that of the nearest facet."""
     xd = die.position(z)
     candidates = _near(die, xd, x, np.array([0, 2]))
@@ -624,6 +633,12 @@ def _seek(die: Facets, z: Array, x: Array, N: Array) -> tuple[Index, _Met, np.nd
     facet = candidates[row, best]
     k, l = (v.reshape(n, c)[row, best][:, None] for v in (k, l))  # noqa: E741
     past = outside[row, best] > 0.5 + 1e-9
+    if keep is not None:
+        half = np.full((n, 1), 0.5)
+        kept_k, kept_l = _flat_places(xd[keep], x, half, half, die.nodes.shape[1])
+        stays = np.maximum(np.abs(kept_k - 0.5), np.abs(kept_l - 0.5)) < 0.5 + HELD
+        k, l = np.where(stays, kept_k, k), np.where(stays, kept_l, l)  # noqa: E741
+        facet = np.where(stays[:, 0], keep, facet)
     met, _, _ = _meet_facets(die, xd, facet, x[:, None], N[:, None], k, l)
     return facet, met, past
 

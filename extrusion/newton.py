@@ -51,7 +51,7 @@ class Newton:
         self._max = max_iterations
         facet = min((float(np.median(term.pair.slave.length)) for term in problem.terms), default=np.inf)
         self._near = min(0.02 * problem.case.profile.radius, 0.5 * facet) if near is None else near
-        self._update, self._fresh = np.inf, False
+        self._update, self._fresh, self._holds = np.inf, False, False
         self._f = problem.x.duplicate()
         self._trial = problem.x.duplicate()
         self._trial_f = problem.x.duplicate()
@@ -75,7 +75,11 @@ class Newton:
 
     def _tangent(self, x: PETSc.Vec) -> None:
         """Hand SNES the tangent; where its pattern has grown it is a new matrix, which the linear solve then takes."""
-        A = self.problem.tangent(x, self._update < self._near)
+        near = self._update < self._near
+        if near and not self._holds:
+            self.problem.hold(x)
+            self._holds = True
+        A = self.problem.tangent(x, near)
         if A != self.A:
             self._last_A, self.A = self.A, A  # SNES still looks at the old one on its way out of this call
             self.snes.setJacobian(self._hand_over, A)
@@ -126,7 +130,8 @@ class Newton:
 
     def solve(self, x: PETSc.Vec) -> Outcome:
         """Solve from x, in place; x already carries the supports' values."""
-        self.history, self._update, self._fresh = [], np.inf, False
+        self.history, self._update, self._fresh, self._holds = [], np.inf, False, False
+        self.problem.hold(None)
         self.tolerance = max(self.atol, self.problem.round_off(x))
         predicted = self._predict(x)
         self.snes.solve(None, x)

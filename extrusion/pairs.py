@@ -102,9 +102,16 @@ class Pair(ABC):
 
     @abstractmethod
     def points(
-        self, z: Array, order: int, variation: bool, material: Elastic | None = None
+        self, z: Array, order: int, variation: bool, material: Elastic | None = None, keep: Index | None = None
     ) -> tuple[Points, Array | None, Array | None]:
-        """Integration points, the rows of the slave's own stress there, and their derivative along the facet."""
+        """Integration points, the rows of the slave's own stress there, and their derivative along the facet.
+
+        ``keep``: die facets to stay with, from `facing`, where points are not split at the facets' edges.
+        """
+
+    def facing(self, points: Points) -> Index | None:
+        """The die facets that points face, if a gap that passes from one to the next has a kink there."""
+        return None
 
     @abstractmethod
     def closed_rows(self, order: int, material: Elastic) -> tuple[Array, Array, Array, Index]:
@@ -233,7 +240,7 @@ class CurvePair(Pair):
         return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(X, axis=0), axis=1)))
 
     def points(
-        self, z: Array, order: int, variation: bool, material: Elastic | None = None
+        self, z: Array, order: int, variation: bool, material: Elastic | None = None, keep: Index | None = None
     ) -> tuple[Points, Array | None, Array | None]:
         slave = self.slave
         direction: Array = self.direction

@@ -91,13 +91,13 @@ class SurfacePair(Pair):
     # -- points ----------------------------------------------------------------------------------------------
 
     def points(
-        self, z: Array, order: int, variation: bool, material: Elastic | None = None
+        self, z: Array, order: int, variation: bool, material: Elastic | None = None, keep: Index | None = None
     ) -> tuple[Points, Array | None, Array | None]:
         slave = self.slave
         if self.ray and self.axis == 0:
             points = line_points(slave, self.die, z, self.sign, order, variation)
         else:
-            points = scattered_points(slave, self.die, z, self.axis, self.sign, order, self.ray, self.smooth)
+            points = scattered_points(slave, self.die, z, self.axis, self.sign, order, self.ray, self.smooth, keep)
         if material is None:
             return points, None, None
         n_u, n_points = 3 * slave.cell_nodes.shape[1], points.G.shape[2]
@@ -124,6 +124,10 @@ class SurfacePair(Pair):
         if slave.pressure_cols is not None:
             points = widened(points, slave.pressure_cols[points.facet])
         return points, S, S_xi
+
+    def facing(self, points: Points) -> Index | None:
+        unsplit = self.ray and self.axis == 1 and isinstance(self.die, Facets)
+        return points.die if unsplit else None
 
     def closed_rows(self, order: int, material: Elastic) -> tuple[Array, Array, Array, Index]:
         slave = self.slave

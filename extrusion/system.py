@@ -117,6 +117,12 @@ class System(ABC):
         for term in self.terms:
             term.accept(z)
 
+    def hold(self, x: PETSc.Vec | None) -> None:
+        """Stay with the die facets that are faced at x where a change of facet has a kink; None: let go."""
+        z = None if x is None else self.gather(x)
+        for term in self.terms:
+            term.hold(z)
+
     def expect(self, on: bool) -> bool:
         """Take the accepted contact set, where it stood in the die, as given; say if any zone has one."""
         return any([term.expect(on) for term in self.terms])

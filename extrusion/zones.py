@@ -46,6 +46,9 @@ class ContactTerm(Protocol):
     def tangent(self, z: Array, geometric: bool) -> Triplets:
         """Derivative of the residual as (rows, columns, values); ``geometric`` adds the second variation of the gap."""
 
+    def hold(self, z: Array | None) -> None:
+        """Near the solution: stay with the die facets that are faced at z, where they are not split; None: let go."""
+
     def accept(self, z: Array) -> None:
         """Make z the accepted state."""
 
@@ -121,6 +124,9 @@ class NodalContact:
 
     def settled(self, z: Array) -> bool:
         return True
+
+    def hold(self, z: Array | None) -> None:
+        pass
 
     def expect(self, on: bool) -> bool:
         return False
@@ -216,6 +222,10 @@ class IntegratedContact:
         self._accepted: ContactSet | None = None
         self._expects = False
         self._known: tuple[Array, tuple[Points, Array | None, Array | None]] | None = None
+        self._held: Index | None = None
+
+    def hold(self, z: Array | None) -> None:
+        self._held = None if z is None or self.pair.is_far(z, self._radius) else self.pair.facing(self._points(z)[0])
 
     def start(self, z: Array) -> None:
         points = self._points(z)[0]
@@ -253,7 +263,7 @@ class IntegratedContact:
         """
         if self._known is None or not np.array_equal(self._known[0], z):
             variation = self.pair.closure != "check"
-            self._known = z.copy(), self.pair.points(z, self._order, variation, self._material)
+            self._known = z.copy(), self.pair.points(z, self._order, variation, self._material, self._held)
         return self._known[1]
 
     def _law(self, z: Array, points: Points, S: Array | None) -> tuple[Array, Array, Array, Array]:
@@ -390,6 +400,10 @@ class MortarContact:
         self._accepted: ContactSet | None = None
         self._expects = False
         self._known: tuple[Array, Points] | None = None
+        self._held: Index | None = None
+
+    def hold(self, z: Array | None) -> None:
+        self._held = None if z is None or self.pair.is_far(z, self._radius) else self.pair.facing(self._points(z))
 
     def start(self, z: Array) -> None:
         points = self._points(z)
@@ -421,7 +435,8 @@ class MortarContact:
     def _points(self, z: Array) -> Points:
         """Contact points with their variation, as those of `IntegratedContact`."""
         if self._known is None or not np.array_equal(self._known[0], z):
-            self._known = z.copy(), self.pair.points(z, self._order, self.pair.closure != "check")[0]
+            variation = self.pair.closure != "check"
+            self._known = z.copy(), self.pair.points(z, self._order, variation, keep=self._held)[0]
         return self._known[1]
 
     def stiffness_norm(self) -> float:
