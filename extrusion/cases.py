@@ -472,4 +472,79 @@ I = Case(  # noqa: E741
     figures=_k((5, 5.0, 1e-3), (140, 144.948, 1e-3)),
 )
 
-CASES: dict[str, Case] = {case.name: case for case in (A, C, D, E, H, I)}
+THREE_D = ((5.0, 5.0), (10.0, 15.0), (5.0, 20.0), (10.0, 70.0), (35.0, 140.0), (15.0, 155.0))
+"""Increments of B, F and G."""
+
+B = Case(
+    name="B",
+    title="3D hexahedra of order 1, discrete contact (nodal), unilateral, zones 1 and 2",
+    space="3d",
+    zones=(replace(SIDE, smooth=True), replace(FRONT, smooth=True)),
+    method="nodal",
+    order=1,
+    increments=THREE_D,
+    figures=_k(
+        (5, 5.0, 1e-3),
+        (20, 20.825, 1e-2),
+        (50, 55.880, 1e-2),
+        (70, 78.690, 1e-2),
+        (140, 144.895, 1e-2),
+        (155, 155.096, 1e-2),
+    ),
+)
+
+F = Case(
+    name="F",
+    title="3D hexahedra of order 1, discrete contact (nodal), bilateral (glissière), zone 1",
+    space="3d",
+    zones=(_bilateral(SIDE, smooth=True),),
+    method="nodal",
+    order=1,
+    increments=THREE_D,
+    figures=_k(
+        (5, 5.0, 1e-2),
+        (20, 20.825, 1.8e-2),
+        (50, 55.880, 1.1e-2),
+        (70, 78.690, 1e-2),
+        (140, 144.895, 1e-2),
+        (155, 155.096, 3e-2),
+    ),
+)
+
+G = Case(
+    name="G",
+    title="3D 20-node hexahedra, discrete contact (nodal), bilateral (glissière), zone 1",
+    space="3d",
+    zones=(_bilateral(SIDE, smooth=True),),
+    method="nodal",
+    order=2,
+    element="serendipity",
+    increments=THREE_D,
+    figures=_k(
+        (5, 5.0, 1e-2),
+        (20, 20.825, 2e-2),
+        (50, 55.880, 2e-2),
+        (70, 78.690, 1e-2),
+        (140, 144.895, 1e-2),
+        (155, 155.096, 5e-2),
+    ),
+)
+
+J = Case(
+    name="J",
+    title="3D hexahedra of order 1, continuous contact at nodes, zone 1 bilateral, zone 2 unilateral (slave: die)",
+    space="3d",
+    zones=(_bilateral(SIDE, smooth=True, initial="interpenetrating"), replace(FRONT, smooth=True, slave="die")),
+    method="nodal",
+    order=1,
+    off_symmetry=1e-6,
+    increments=((5.0, 20.0), (10.0, 70.0), (35.0, 140.0), (15.0, 155.0)),
+    # at t = 140 it is L, which the cone holds
+    figures=(
+        *_k((5, 5.0, 1e-3), (20, 20.825, 2e-2), (50, 55.880, 1.5e-2)),
+        Figure(t=140, value=140.0, tolerance=1e-3, point="L"),
+        Figure(t=155, value=155.0, tolerance=1e-3),
+    ),
+)
+
+CASES: dict[str, Case] = {case.name: case for case in (A, B, C, D, E, F, G, H, I, J)}
