@@ -477,11 +477,9 @@ class _Rings:
             raise ArithmeticError("the deformed die is no graph over the axis")
         # the reference direction in which the die goes on past its ends, per line
         X = die.X[grid[[0, -1]]]
-        steps = np.stack([X[end][:, self._edge[1]] - X[end][:, self._edge[0]] for end in (0, 1)]).mean(axis=2)
-        e = radial(X.mean(axis=2))
-        r, y = np.einsum("eci,eci->ec", steps, e), steps[..., 1]
-        self._slope = (r / y)[:, self._column]
-        self._middle = middle
+        steps = X[:, :, self._edge[1]] - X[:, :, self._edge[0]]
+        onward = np.einsum("elni,ln->eli", steps[:, self._column], L)
+        self._onward = onward / onward[..., 1:2]
 
     def split(self, where: Index, on: Index, vertex: Index, line: Array, N_line: Array, xi: Array) -> _Splits:
         """Exact places of the splits at the left ends of some pieces, from estimates."""
@@ -526,13 +524,19 @@ class _Rings:
         k = np.where(past[:, None], np.where(opposite >= m, 1.0, 0.0)[:, None], np.clip(k, 0.0, 1.0))
         l = np.broadcast_to(self._l[on][:, None], k.shape)  # noqa: E741
         end = np.where(opposite >= m, 1, 0)
-        direction = np.array([0.0, 1.0, 0.0]) + self._slope[end, on][:, None] * radial(self._middle[on])
-        met, _, _ = _meet_facets(die, self._xd, facet, x, N, k, l, (past, direction))
+        met, _, _ = _meet_facets(die, self._xd, facet, x, N, k, l, (past, self._onward[end, on]))
         return met, facet, past
 
 
 def scattered_points(
-    slave: Facets, die: Facets | Revolved, z: Array, axis: int, sign: float, order: int, ray: bool, smooth: bool,
+    slave: Facets,
+    die: Facets | Revolved,
+    z: Array,
+    axis: int,
+    sign: float,
+    order: int,
+    ray: bool,
+    smooth: bool,
     keep: Index | None = None,
 ) -> SurfacePoints:
     """Integration points at fixed places of the slave's facets, each a piece of its own, with what they face.
@@ -600,7 +604,9 @@ def meet(
     if axis == 1:
         return _seek(die, z, x, N, keep)
     rings = _Rings(die, z, X)
-    opposite = (rings.p <= p[:, None]).sum(axis=1) - 1
+    rest = 1e-12 * np.abs(rings.p).max(initial=1.0)
+    opposite = (rings.p <= p[:, None] + rest).sum(axis=1) - 1
+    opposite -= (opposite == rings.p.shape[1] - 1) & (p <= rings.p[:, -1] + rest)  # on the last ring it is not past
     met, number, past = rings.meet(np.arange(len(x)), opposite, x[:, None], N[:, None])
     return number, met, past
 
@@ -632,7 +638,8 @@ def _seek(die: Facets, z: Array, x: Array, N: Array, keep: Index | None = None) 
     row = np.arange(n)
     facet = candidates[row, best]
     k, l = (v.reshape(n, c)[row, best][:, None] for v in (k, l))  # noqa: E741
-    past = outside[row, best] > 0.5 + 1e-9
+    past = ~(outside[row, best] <= 0.5 + 1e-9)
+    k, l = (np.where(np.isnan(v), 0.5, v) for v in (k, l))  # noqa: E741
     if keep is not None:
         half = np.full((n, 1), 0.5)
         kept_k, kept_l = _flat_places(xd[keep], x, half, half, die.nodes.shape[1])
@@ -644,7 +651,7 @@ def _seek(die: Facets, z: Array, x: Array, N: Array, keep: Index | None = None) 
 
 
 def _flat_places(nodes: Array, x: Array, k: Array, l: Array, n: int) -> tuple[Array, Array]:  # noqa: E741
-    """Places (k, l) of facets where they have the (x, z) of points."""
+    """Places (k, l) of facets where they have the (x, z) of points; nan where none is found (far outside)."""
     across = [0, 2]
     for _ in range(8):
         M, M_k, M_l = (shape2(n, k, l, *d) for d in ((0, 0), (1, 0), (0, 1)))
@@ -655,7 +662,9 @@ def _flat_places(nodes: Array, x: Array, k: Array, l: Array, n: int) -> tuple[Ar
         dk = (out[:, 0] * b[:, 1] - out[:, 1] * b[:, 0]) / det
         dl = (a[:, 0] * out[:, 1] - a[:, 1] * out[:, 0]) / det
         k, l = np.clip(k - dk[:, None], -2.0, 3.0), np.clip(l - dl[:, None], -2.0, 3.0)  # noqa: E741
-    return k, l
+    miss = np.linalg.norm((shape2(n, k, l) @ nodes)[:, 0][:, across] - x[:, across], axis=1)
+    lost = ~(miss <= 1e-6 * np.ptp(nodes[:, :, across], axis=1).max(axis=1))[:, None]
+    return np.where(lost, np.nan, k), np.where(lost, np.nan, l)
 
 
 @dataclass(frozen=True)

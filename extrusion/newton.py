@@ -14,6 +14,10 @@ from extrusion.system import System
 REASONS = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 
 
+ROUGHLY = 1e-4
+"""Part of the first residual at which a solve of few iterations may end."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What one nonlinear solve did."""
@@ -124,12 +128,13 @@ class Newton:
             return int(reason.DIVERGED_FNORM_NAN)
         if norm <= self.tolerance:
             return int(reason.CONVERGED_FNORM_ABS)
-        if it >= self._max:
+        if it >= self._limit or (self._limit < self._max and norm < ROUGHLY * self.history[0]):
             return int(reason.DIVERGED_MAX_IT)
         return int(reason.ITERATING)
 
-    def solve(self, x: PETSc.Vec) -> Outcome:
-        """Solve from x, in place; x already carries the supports' values."""
+    def solve(self, x: PETSc.Vec, at_most: int | None = None) -> Outcome:
+        """Solve from x, in place; x already carries the supports' values. Or take ``at_most`` so many iterations."""
+        self._limit = self._max if at_most is None else at_most
         self.history, self._update, self._fresh, self._holds = [], np.inf, False, False
         self.problem.hold(None)
         self.tolerance = max(self.atol, self.problem.round_off(x))

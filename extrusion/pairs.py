@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from extrusion.contact import Closure
+from extrusion.contact import CLOSED_GAP, Closure
 from extrusion.elasticity import Elastic
 from extrusion.gap import (
     Array,
@@ -44,6 +44,12 @@ class ContactState:
     ray_pressure: Array  # (n,) its component along the ray per reference area, MPa
     weight: Array  # (n,) integration weight, mm^2
     closed: np.ndarray = field(repr=False)  # (n,) bool
+
+
+def closed_at_start(gap: Array, radius: float, interpenetrating: bool) -> np.ndarray:
+    """Points that a bilateral zone holds from t = 0: gap zero, or also negative where the start may interpenetrate."""
+    touching = np.abs(gap) < CLOSED_GAP * radius
+    return touching | (gap < 0) if interpenetrating else touching
 
 
 @dataclass(frozen=True)
@@ -108,6 +114,10 @@ class Pair(ABC):
 
         ``keep``: die facets to stay with, from `facing`, where points are not split at the facets' edges.
         """
+
+    def touches(self, z: Array, points: Points, radius: float, interpenetrating: bool) -> np.ndarray:
+        """Which of points at the start a bilateral zone holds from then on."""
+        return closed_at_start(points.gap, radius, interpenetrating)
 
     def facing(self, points: Points) -> Index | None:
         """The die facets that points face, if a gap that passes from one to the next has a kink there."""

@@ -21,7 +21,7 @@ from extrusion.gap3d import (
     shape2,
     stress_rows,
 )
-from extrusion.pairs import ContactState, NodeRows, Pair, widened
+from extrusion.pairs import ContactState, NodeRows, Pair, closed_at_start, widened
 
 COPIES = 4
 """A quarter is solved, and what is reported is of the whole revolution."""
@@ -124,6 +124,14 @@ class SurfacePair(Pair):
         if slave.pressure_cols is not None:
             points = widened(points, slave.pressure_cols[points.facet])
         return points, S, S_xi
+
+    def touches(self, z: Array, points: Points, radius: float, interpenetrating: bool) -> np.ndarray:
+        # between its nodes a facet that touches is off the circle by a little: what counts are the nodes
+        nodes, held = self.nodes, closed_at_start(self.at_nodes(z).gap, radius, interpenetrating)
+        of_node = np.zeros(int(nodes.max()) + 1, dtype=bool)
+        of_node[nodes] = held
+        whole = of_node[self.slave.nodes].all(axis=1)
+        return np.broadcast_to(whole[points.facet][:, None], points.gap.shape)
 
     def facing(self, points: Points) -> Index | None:
         unsplit = self.ray and self.axis == 1 and isinstance(self.die, Facets)

@@ -30,6 +30,12 @@ CAUGHT = 1e-3
 PASSES = 30
 """Geometry passes of one increment (nodal contact) before it is cut."""
 
+ROUGH = 4
+"""Passes that may be solved roughly, as long as the pairing still changes by a tenth of the increment."""
+
+AT_MOST = 2
+"""Linear solves of a rough pass."""
+
 SETTLE = 3
 """Passes after which a node that rests on a die vertex stays with the facet it had."""
 
@@ -160,12 +166,14 @@ def _increment(problem: System, newton: Newton, accepted: PETSc.Vec) -> _Attempt
     iterations, change = 0, x.duplicate()
     seen: list[float] = []
     previous = x.duplicate()
+    rough = frozen  # while the pairing still changes much, few iterations are as good as many
     for attempt in range(1, PASSES + 1):
         problem.pair_up(x, settle=attempt > (SETTLE if frozen else 1))
         x.copy(previous)
-        outcome = newton.solve(x)
+        rough &= attempt <= ROUGH
+        outcome = newton.solve(x, AT_MOST if rough else None)
         iterations += outcome.iterations
-        if not outcome.converged:
+        if not outcome.converged and not (rough and np.isfinite(outcome.residual)):
             if attempt == 1 and problem.may_settle:
                 previous.copy(x)
                 continue
@@ -177,8 +185,10 @@ def _increment(problem: System, newton: Newton, accepted: PETSc.Vec) -> _Attempt
         change.waxpy(-1.0, previous, x)
         moved = problem.largest_displacement(change)
         change.waxpy(-1.0, accepted, x)
-        if attempt >= 2 and moved <= PASS_TOLERANCE * problem.largest_displacement(change):
+        increment = problem.largest_displacement(change)
+        if not rough and attempt >= 2 and moved <= PASS_TOLERANCE * increment:
             break
+        rough &= moved > 10 * PASS_TOLERANCE * increment
         seen.append(moved)
     else:
         if not frozen:

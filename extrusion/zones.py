@@ -12,10 +12,10 @@ from typing import Protocol
 
 import numpy as np
 
-from extrusion.contact import CLOSED_GAP, project
+from extrusion.contact import project
 from extrusion.elasticity import Elastic
 from extrusion.gap import Array, Index, Points
-from extrusion.pairs import ContactState, Pair, take
+from extrusion.pairs import ContactState, Pair, closed_at_start, take
 
 Triplets = tuple[Index, Index, Array]
 
@@ -60,12 +60,6 @@ class ContactTerm(Protocol):
 
     def stiffness_norm(self) -> float:
         """Norm of force over gap, N/mm: how much round-off in a position weighs in the residual."""
-
-
-def closed_at_start(gap: Array, radius: float, interpenetrating: bool) -> np.ndarray:
-    """Points that a bilateral zone holds from t = 0: gap zero, or also negative where the start may interpenetrate."""
-    touching = np.abs(gap) < CLOSED_GAP * radius
-    return touching | (gap < 0) if interpenetrating else touching
 
 
 @dataclass(frozen=True)
@@ -229,7 +223,8 @@ class IntegratedContact:
 
     def start(self, z: Array) -> None:
         points = self._points(z)[0]
-        self.closed = self._whole_facets(points, closed_at_start(points.gap, self._radius, self._interpenetrating))
+        held = self.pair.touches(z, points, self._radius, self._interpenetrating)
+        self.closed = self._whole_facets(points, held)
         self.caught = _farthest(points.gap, self.closed[points.facet])
 
     def pair_up(self, z: Array, settle: bool = False) -> None:
@@ -407,7 +402,7 @@ class MortarContact:
 
     def start(self, z: Array) -> None:
         points = self._points(z)
-        held = closed_at_start(points.gap, self._radius, self._interpenetrating)
+        held = self.pair.touches(z, points, self._radius, self._interpenetrating)
         self.closed[:] = True
         ends = self._ends[points.facet]
         np.logical_and.at(self.closed, ends, held.all(axis=1)[:, None])

@@ -18,14 +18,13 @@ from extrusion.cases import A, Case
 from extrusion.contact import CLOSURES, Closure
 from extrusion.gap import Surface, polyline
 from extrusion.mesh import case_mesh
-from extrusion.pairs import CurvePair
+from extrusion.pairs import CurvePair, closed_at_start
 from extrusion.problem import Problem
 from extrusion.profile import SSNV504
 from extrusion.zones import (
     ContactTerm,
     IntegratedContact,
     NodalContact,
-    closed_at_start,
 )
 
 LAWS = [("nodal", 0), ("mortar", 0), ("penalty", 0), ("nitsche", -1), ("nitsche", 0), ("nitsche", 1)]
