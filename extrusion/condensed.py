@@ -162,6 +162,7 @@ class Condensed(System):
         self.n_forces = len(self.z_forced)
         self._force_of_z = np.full(self.n_z, -1)
         self._force_of_z[self.z_forced] = np.arange(self.n_forces)
+        self.node = np.where(self.z_forced < n_u, self.z_forced // dim, self.z_forced)  # a pressure is one by itself
         self._force_of_z[first:] = self.n_forces + np.arange(self.n_multipliers)
         self.force_body = np.where(in_billet[self.z_forced], 0, 1)
         self._force_dofs = full.z_to_x[self.z_forced]
@@ -179,10 +180,11 @@ class Condensed(System):
     def _factor(self) -> None:
         began = time.perf_counter()
         self._bulk = [_Factor(A, rows) for A, rows in self.full.bulk()]
-        # the compliance of each body, of which columns are made on demand
-        self.C = [np.zeros((body.stop - body.start, 0)) for body in self.bodies]
-        self.column = np.full(self.n_forces, -1)  # of each force, in its body's C
-        self._forces: list[Index] = [np.zeros(0, dtype=np.int64) for _ in self.bodies]  # of each column
+        # C of each body, a row for each of its forces, made on demand (until then they take no memory)
+        self.of_body = [np.flatnonzero(self.force_body == body) for body in (0, 1)]
+        shapes = [(len(forces), rows.stop - rows.start) for forces, rows in zip(self.of_body, self.bodies, strict=True)]
+        self.C = [np.zeros(shape if self.on_root else (0, 0)) for shape in shapes]
+        self._made = np.zeros(self.n_forces, dtype=bool)
         self._drive_norm = self.full.size_of_drive()
         self.seconds = {"factor": time.perf_counter() - began, "condensation": 0.0}
         bodies = np.bincount(self.force_body, minlength=2)
@@ -203,11 +205,11 @@ class Condensed(System):
     @property
     def right_hand_sides(self) -> int:
         """Columns of the compliance made so far."""
-        return sum(len(forces) for forces in self._forces)
+        return int(self._made.sum())
 
     def provide(self, wanted: Index) -> None:
         """Make the columns of C for some forces (given on rank 0), and for those beside them. Collective."""
-        missing = wanted[self.column[wanted] < 0] if self.on_root else wanted
+        missing = wanted[~self._made[wanted]] if self.on_root else wanted
         if self.comm.size > 1:
             missing = self.comm.bcast(missing if len(missing) else None)
         if missing is None or not len(missing):
@@ -215,30 +217,27 @@ class Condensed(System):
         began = time.perf_counter()
         near = np.zeros(self.n_forces, dtype=bool)
         near[missing] = True
-        reach = np.convolve(near, np.ones(2 * MARGIN + 1))[MARGIN:-MARGIN] > 0
-        have = np.zeros(self.n_forces, dtype=bool)
-        have[np.concatenate(self._forces)] = True
-        for body in (0, 1):
-            new = np.flatnonzero(reach & ~have & (self.force_body == body))
-            parts = [self._solve(new[i : i + BLOCK], body) for i in range(0, len(new), BLOCK)]
-            if self.on_root:
-                self.C[body] = np.concatenate([self.C[body], *parts], axis=1)
-            self.column[new] = len(self._forces[body]) + np.arange(len(new))
-            self._forces[body] = np.concatenate([self._forces[body], new])
+        new = (np.convolve(near, np.ones(2 * MARGIN + 1))[MARGIN:-MARGIN] > 0) & ~self._made
+        for body, (C, forces) in enumerate(zip(self.C, self.of_body, strict=True)):
+            if body == 1 and self._stiff_die:
+                continue
+            rows = np.flatnonzero(new[forces])
+            for some in (rows[i : i + BLOCK] for i in range(0, len(rows), BLOCK)):
+                u = self._bulk[body].solve(self._force_dofs[forces[some]], self.dofs[self.bodies[body]])
+                if self.on_root:
+                    C[some] = u
+        self._made |= new
         self.seconds["condensation"] += time.perf_counter() - began
 
-    def _solve(self, forces: Index, body: int) -> Array:
-        """Rows of one body in K^-1 E^T for some forces on it; on rank 0."""
-        if body == 1 and self._stiff_die:
-            return np.zeros((self.bodies[1].stop - self.bodies[1].start, len(forces)))
-        return self._bulk[body].solve(self._force_dofs[forces], self.dofs[self.bodies[body]])
-
-    def _displacements(self, f: Array) -> Array:
-        """-C f at all rows."""
+    def displacements(self, f: Array) -> Array:
+        """-C f at all rows; on rank 0."""
         out = np.zeros(self.n_read)
-        for body, C, forces in zip(self.bodies, self.C, self._forces, strict=True):
-            if len(forces):
-                out[body] = -(C @ f[forces])
+        for body, C, forces in zip(self.bodies, self.C, self.of_body, strict=True):
+            of = f[forces]
+            on = np.flatnonzero(of)
+            if len(on):  # contact is somewhere along the body, and so are they
+                some = slice(on[0], on[-1] + 1)
+                out[body] = -of[some] @ C[some]
         return out
 
     def die_effect(self, x: PETSc.Vec) -> tuple[float, float]:
@@ -294,7 +293,7 @@ class Condensed(System):
                 return z
         t, f, multipliers = self._split(x)
         z = t * self._z_drive + self._z_start * self._placed
-        z[self._z_of] += self._displacements(f)[self._in_z]
+        z[self._z_of] += self.displacements(f)[self._in_z]
         z[self.n_z - self.n_multipliers :] = multipliers
         self._known = [(np.array(x.array_r), z), *self._known[:1]]
         return z
@@ -315,8 +314,12 @@ class Condensed(System):
     def largest_displacement(self, x: PETSc.Vec) -> float:
         largest = 0.0
         if self.on_root:
-            t, f, _ = self._split(x)
-            largest = float(np.max(np.abs(t * self._z_drive[self._z_of] + self._displacements(f)[self._in_z])))
+            if len(self._known) == 2 and np.array_equal(self._known[1][0] - x.array_r, self._known[0][0]):
+                u = (self._known[1][1] - self._known[0][1])[self._z_of]  # x is the step between the last two
+            else:
+                t, f, _ = self._split(x)
+                u = t * self._z_drive[self._z_of] + self.displacements(f)[self._in_z]
+            largest = float(np.max(np.abs(u)))
         return self.comm.bcast(largest) if self.comm.size > 1 else largest
 
     def recover(self, x: PETSc.Vec) -> PETSc.Vec:
@@ -353,26 +356,23 @@ class Condensed(System):
         return out
 
     def tangent(self, x: PETSc.Vec, geometric: bool) -> PETSc.Mat:
-        D, F = None, np.zeros(0)
+        D, f = None, np.zeros(0)
         if self.on_root:
-            z = self._z(x)
-            F = self._out_of_balance(x, z)
+            z, f = self._z(x), self._split(x)[1]
             parts = [term.tangent(z, geometric) for term in self.terms]
             rows, cols, values = (np.concatenate(part) for part in zip(*parts, strict=True))
             rows, cols = self._force_of_z[rows], self._row_of_z[cols]
             keep = (rows >= 0) & (cols >= 0) & (values != 0.0)
             D = _Derivative(rows[keep], cols[keep], values[keep])
-        self._tangent.set(D, F)
+        self._tangent.set(D, f)
         return self._A
 
     def forget_pattern(self) -> None:
         self._tangent.forget()
 
     def set_solver(self, ksp: PETSc.KSP) -> None:
-        """Flexible GMRES, preconditioned by a dense factorisation over the forces that act."""
-        ksp.setType("fgmres")
-        ksp.setGMRESRestart(self._tangent.STALE)  # where it is factored anew it starts from the residual
-        ksp.setTolerances(rtol=self._tangent.rtol, atol=1e-50, max_it=60)
+        """By `_Tangent`, which solves whole."""
+        ksp.setType("preonly")
         pc = ksp.getPC()
         pc.setType("python")
         pc.setPythonContext(self._tangent)
@@ -414,7 +414,7 @@ class Condensed(System):
         found = None
         if self.on_root:
             t, f, _ = self._split(x)
-            u = np.append(self._displacements(f), 0.0)
+            u = np.append(self.displacements(f), 0.0)
             values = t * self._watched_drive + self._placed * self._watched_start + u[self._watched]
             found = {name: (float(r), float(y)) for name, (r, y) in zip(self._watch, values, strict=True)}
         found = self.comm.bcast(found) if self.comm.size > 1 else found
@@ -467,7 +467,7 @@ class _Factor:
         return np.asarray(self._order[np.searchsorted(self._rows, entries, sorter=self._order)])
 
     def solve(self, forces: Index, read: Index) -> Array:
-        """Entries ``read`` of the solution for a unit force at each of ``forces`` (a column each); on rank 0."""
+        """Entries ``read`` of the solution for a unit force at each of ``forces`` (a row each); on rank 0."""
         comm, n, size = self._comm, self._A.size[0], len(forces)
         first, end = self._A.owner_range
         at, wanted = self._at(forces), self._at(read)
@@ -487,12 +487,12 @@ class _Factor:
         self._F.matSolve(B, X)
         B.destroy()
         mine = np.flatnonzero((wanted >= first) & (wanted < end))
-        values = X.getDenseArray()[wanted[mine] - first]
+        values = X.getDenseArray().T[:, wanted[mine] - first]
         if comm.size == 1:
-            return np.ascontiguousarray(values)
-        out = np.zeros((len(wanted), size))
+            return np.asarray(values)
+        out = np.zeros((size, len(wanted)))
         for where, part in comm.gather((mine, values)) or ():
-            out[where] = part
+            out[:, where] = part
         return out
 
     def back(self, forces: Index, values: Array) -> tuple[Index, Array]:
@@ -519,16 +519,17 @@ class _Derivative:
 
 
 class _Tangent:
-    """``-1 - D C`` over the forces, and D's columns of the multipliers: PETSc's matrix of it, and a preconditioner.
+    """``-1 - D C`` over the forces, and D's columns of the multipliers: PETSc's matrix of it, and its solver.
 
     D is the derivative of contact's forces by what they read. Without friction the force on a node acts along a
     normal that hardly turns, so its two rows of D are nearly parallel, and the preconditioner takes one unknown w for
-    both: with D = E D_B, and E as wide as the rows B that are kept, ``f = E w - F`` and::
+    both: with D = E D_B, and E as wide as the rows B that are kept, ``f = E w - h``, where ``h = F - E F_B``, and::
 
-        (1 + D_B C E) w - D_B,p p = D_B C F        p: the multipliers, whose rows stay as they are
+        (1 + D_B C E) w - D_B,p p = D_B C h - F_B        p: the multipliers, whose rows stay as they are
 
     is solved by a dense factorisation. Rows that are not parallel (at the die's corners, at the billet's edge) are all
     kept. The factorisation serves until the Krylov method, for which the change of D is small, takes too long with it.
+    That is GCR, which wants the image of each correction f: with C h and C E w at hand, one more product with D.
 
     Where there are many forces all of this is in single precision, of which Newton's method, whose residual is not,
     takes no harm: it gains six digits an iteration.
@@ -537,7 +538,7 @@ class _Tangent:
     PARALLEL = 0.1
     """Part of a row that may stand out of its neighbour's direction."""
 
-    STALE = 12
+    STALE = 20
     """Krylov iterations after which a factorisation of an earlier tangent is made anew."""
 
     MANY = 1200
@@ -546,180 +547,211 @@ class _Tangent:
     def __init__(self, system: Condensed) -> None:
         self._system = weakref.proxy(system)  # PETSc holds this object in C
         self._dtype: Any = np.float32 if system.n_forces > self.MANY else np.float64
-        self.rtol = 1e-6 if self._dtype == np.float32 else 1e-11
-        self._forces = np.zeros(0, dtype=np.int64)  # in the order of the rows that follow
-        self._pressures = np.zeros(0, dtype=np.int64)
-        self._read = [np.zeros(0, dtype=np.int64) for _ in range(2)]  # rows of each body's C that D reads
-        self._applied = 0
+        self._rtol = 1e-6 if self._dtype == np.float32 else 1e-11
+        self._getrs = scipy.linalg.get_lapack_funcs("getrs", dtype=self._dtype)
+        # of each body, for which forces and rows C is held, and C there
+        self._held = [(np.zeros(n, dtype=bool), np.zeros(m, dtype=bool)) for n, m in map(np.shape, system.C)]
+        self._C = [np.zeros((0, 0), dtype=self._dtype) for _ in system.C]
+        self._pressed = np.zeros(system.n_multipliers, dtype=bool)  # multipliers that have a part in the solve
         self.forget()
 
     def forget(self) -> None:
         """Factor the next tangent anew."""
         self._lu: Any = None
 
-    def set(self, D: _Derivative | None, F: Array) -> None:
-        """Take a derivative and the residual it belongs to (on rank 0). Collective."""
+    def set(self, D: _Derivative | None, f: Array) -> None:
+        """Take a derivative and the forces it belongs to (on rank 0). Collective."""
         system = self._system
         n_f = system.n_forces
         involved = np.zeros(0, dtype=np.int64)
         if D is not None:
-            own = (D.rows >= n_f) & (D.cols - system.n_read == D.rows - n_f)  # multipliers on their own rows
             self._diagonal = np.full(n_f + system.n_multipliers, -1.0)
+            self._acts = acts = np.zeros(len(self._diagonal), dtype=bool)
+            own = (D.rows >= n_f) & (D.cols - system.n_read == D.rows - n_f)  # multipliers on their own rows
             self._diagonal[n_f:] = np.bincount(D.rows[own] - n_f, D.values[own], system.n_multipliers)
-            active = np.bincount(D.rows[~own], minlength=len(self._diagonal)) > 0
-            active[n_f + D.cols[~own & (D.cols >= system.n_read)] - system.n_read] = True
-            involved = np.flatnonzero(active[:n_f] | (F[:n_f] != 0.0))
+            acts[D.rows[~own]] = True
+            acts[n_f + D.cols[~own & (D.cols >= system.n_read)] - system.n_read] = True
+            acts |= self._diagonal == 0.0
+            involved = np.flatnonzero(acts[:n_f] | (f != 0.0))
         system.provide(involved)
         if D is None:
             return
-        self._take(D, involved, n_f + np.flatnonzero(active[n_f:] | (self._diagonal[n_f:] == 0.0)))
+        self._hold(D)
+        r, c = self._row[D.rows], self._col[D.cols]
+        on = np.flatnonzero((r >= 0) & (c >= 0))
+        values = D.values[on].astype(self._dtype)
+        self._D = scipy.sparse.coo_array((values, (r[on], c[on])), shape=(len(self._entries), len(self._cols))).tocsr()
         self._fresh = self._lu is None
         if self._lu is None:
             self._factor(self.PARALLEL)
-        self._applied = 0
 
-    def _take(self, D: _Derivative, forces: Index, pressures: Index) -> None:
-        """D over the forces, pressures and displacements involved; C over them too, if they have not been before."""
-        system = self._system
-        n_f, n_read = system.n_forces, system.n_read
-        read = np.zeros(n_read, dtype=bool)
-        read[D.cols[D.cols < n_read]] = True
-        known = [
-            np.isin(np.flatnonzero(read[span]), rows) for span, rows in zip(system.bodies, self._read, strict=True)
-        ]
-        if not (
-            self._lu is not None
-            and np.isin(forces, self._forces).all()
-            and np.isin(pressures, self._pressures).all()
-            and all(k.all() for k in known)
-        ):
-            if self._lu is not None:  # in the same increment: what has been involved may be so again
-                forces, pressures = np.union1d(forces, self._forces), np.union1d(pressures, self._pressures)
-                for span, rows in zip(system.bodies, self._read, strict=True):
-                    read[span.start + rows] = True
-            self.forget()
-            self._forces, self._pressures = forces, pressures
-            self._read = [np.flatnonzero(read[span]) for span in system.bodies]
-            self._columns = [np.flatnonzero(system.force_body[forces] == body) for body in range(2)]
-            self._C = [
-                C[np.ix_(rows, system.column[forces[columns]])].astype(self._dtype)
-                for C, rows, columns in zip(system.C, self._read, self._columns, strict=True)
-            ]
-        n_rows = len(self._forces) + len(self._pressures)
-        row = np.full(n_f + system.n_multipliers, -1)
-        row[self._forces] = np.arange(len(self._forces))
-        row[self._pressures] = len(self._forces) + np.arange(len(self._pressures))
-        col = np.full(n_read + system.n_multipliers, -1)
-        first = 0
-        for span, rows in zip(system.bodies, self._read, strict=True):
-            col[span.start + rows] = first + np.arange(len(rows))
-            first += len(rows)
-        col[n_read - n_f + self._pressures] = first + np.arange(len(self._pressures))
-        r, c = row[D.rows], col[D.cols]
-        on = (r >= 0) & (c >= 0)
-        shape = n_rows, first + len(self._pressures)
-        self._D = scipy.sparse.coo_array((D.values[on].astype(self._dtype), (r[on], c[on])), shape=shape).tocsr()
+    def _hold(self, D: _Derivative) -> None:
+        """C, and the multipliers, for all that acts and all that is read; if some has not been so, factor anew."""
+        system, n_f = self._system, self._system.n_forces
+        read = np.zeros(system.n_read + system.n_multipliers, dtype=bool)
+        read[D.cols] = True
+        same = self._lu is not None  # increment: what has been involved may be so again
+        pressed = self._acts[n_f:]
+        changes = not (same and (pressed <= self._pressed).all())
+        for body, (C, forces) in enumerate(zip(system.C, system.of_body, strict=True)):
+            held, need = self._held[body], (self._acts[forces], read[system.bodies[body]])
+            if same:
+                need = need[0] | held[0], need[1] | held[1]
+            if np.array_equal(need[0], held[0]) and np.array_equal(need[1], held[1]):
+                continue
+            self._held[body], changes = need, True
+            f, rows = map(np.flatnonzero, need)
+            near = slice(f[0], f[-1] + 1) if len(f) else slice(0, 0)
+            self._C[body] = C[near].take(rows, axis=1, mode="clip").astype(self._dtype)[f - near.start]
+        if not changes:
+            return
+        self.forget()
+        self._pressed = pressed | self._pressed if same else pressed
+        p = np.flatnonzero(self._pressed)
+        held_forces = [forces[held] for forces, (held, _) in zip(system.of_body, self._held, strict=True)]
+        starts = (span.start for span in system.bodies)
+        held_rows = [start + np.flatnonzero(rows) for start, (_, rows) in zip(starts, self._held, strict=True)]
+        self._place = np.zeros(n_f, dtype=np.int64)  # of a force in its body's C
+        self._place[np.concatenate(held_forces)] = np.concatenate([np.arange(len(f)) for f in held_forces])
+        self._set_entries(np.concatenate([*held_forces, n_f + p]))
+        self._from_die = len(held_rows[0])
+        self._cols = np.concatenate([*held_rows, system.n_read + p])
+        self._col = np.full(len(read), -1, dtype=np.int32)
+        self._col[self._cols] = np.arange(len(self._cols))
+
+    def _set_entries(self, entries: Index) -> None:
+        """Which force or multiplier each row of D is of."""
+        self._entries = entries
+        self._row = np.full(len(self._acts), -1, dtype=np.int32)
+        self._row[entries] = np.arange(len(entries))
 
     def _factor(self, parallel: float) -> None:
-        lead, self._two, self._follower, self._slope = self._leaders(parallel)
-        n, m, n_f = len(lead), len(self._pressures), len(self._forces)
-        self._kept = np.concatenate([lead, n_f + np.arange(m)])
-        self._lead = lead
-        self._D_kept = D = self._D[self._kept]
-        M = np.zeros((n + m, n + m), dtype=self._dtype)
-        first = 0
-        of_lead = self._system.force_body[self._forces[lead]]
-        for body, (C, columns) in enumerate(zip(self._C, self._columns, strict=True)):
-            place = np.full(n_f, -1)
-            place[columns] = np.arange(len(columns))
-            mine = np.flatnonzero(of_lead == body)
-            go = np.flatnonzero(of_lead[self._two] == body)
-            widths = np.ones(len(mine) + len(go), dtype=self._dtype)
-            widths[len(mine) :] = self._slope[go]
-            at = np.concatenate([np.arange(len(mine)), np.searchsorted(mine, self._two[go])])
-            E = scipy.sparse.coo_array(
-                (widths, (np.concatenate([place[lead[mine]], place[self._follower[go]]]), at)),
-                shape=(len(columns), len(mine)),
-            )
-            C_E = (E.T.tocsr() @ C.T).T
-            M[:, mine] = D[:, first : first + len(C)] @ C_E
-            first += len(C)
+        """Factor, and put D's rows in this order: forces that are kept, by bodies; multipliers; others, by bodies."""
+        system, n_u = self._system, len(self._cols) - int(np.count_nonzero(self._pressed))
+        leads, follower, two, slope = self._leaders(parallel)
+        body = np.append(system.force_body, np.full(system.n_multipliers, 2))[self._entries]
+        part = np.where(body == 2, 2, 3 + body)
+        part[leads] = body[leads]
+        order = np.argsort(part, kind="stable")
+        ends = [0, *np.cumsum(np.bincount(part, minlength=5)).tolist()]
+        n, kept = self._n, self._kept = ends[2], ends[3]
+        follower, two = self._entries[follower], self._entries[two]
+        self._set_entries(self._entries[order])
+        self._follower, self._two, self._slope = self._row[follower], self._row[two], slope.astype(self._dtype)
+        self._D = self._D[order]
+        self._B = self._D[:kept, :n_u]
+        self._parts = []
+        M = np.zeros((kept, kept), dtype=self._dtype)
+        E = scipy.sparse.csr_array((self._slope, (self._two, self._follower)), shape=(kept, len(order)))
+        for b, (C, cols) in enumerate(zip(self._C, (slice(self._from_die), slice(self._from_die, n_u)), strict=True)):
+            lead, other = slice(ends[b], ends[b + 1]), slice(ends[b + 3], ends[b + 4])
+            C_E, C_h = (C[self._place[self._entries[rows]]] for rows in (lead, other))
+            C_E += E[lead, other] @ C_h
+            M[:, lead] = self._B[:, cols] @ np.ascontiguousarray(C_E.T)
+            self._parts.append((lead, other, C_E, C_h))
         M[n:, :n] *= -1.0
         M[np.arange(n), np.arange(n)] += 1.0
-        pressed = D[:, first:].toarray()
+        pressed = self._D[:kept, n_u:].toarray()
         M[:n, n:] = -pressed[:n]
         M[n:, n:] = pressed[n:]
-        self._lu = scipy.linalg.lu_factor(M.T, overwrite_a=True, check_finite=False) if n + m else ()
+        self._lu = scipy.linalg.lu_factor(M.T, overwrite_a=True, check_finite=False) if kept else ()
 
     def _leaders(self, parallel: float) -> tuple[Index, Index, Index, Array]:
-        """Forces that are kept; of those that go with one: its place there, which they are, and in what proportion."""
-        system, n_f = self._system, len(self._forces)
-        D = self._D[:n_f].copy()
-        of_pressure = D.indices >= D.shape[1] - len(self._pressures)
-        if of_pressure.any() and self._D[n_f:].nnz:  # by pressures as by displacements, each times a stiffness
-            D.data[of_pressure] *= np.max(np.abs(self._D[n_f:].data)) / np.max(np.abs(D.data[of_pressure]))
-        # a node's forces side by side; the one with the largest row leads
-        dim = system.full.dim
-        z = system.z_forced[self._forces]
-        node = np.where(z < dim * len(system.full.z_in_billet), z // dim, -1 - z)
-        square: Array = D.multiply(D).sum(axis=1)
-        order = np.lexsort((z, -square, node))
-        first = np.append(True, np.diff(node[order]) != 0) if n_f else np.zeros(0, dtype=bool)
-        of = order[np.maximum.accumulate(np.where(first, np.arange(n_f), 0))] if n_f else order
-        second, of = order[~first], of[~first]
-        second, of = second[square[of] > 0.0], of[square[of] > 0.0]
-        slope = D[of].multiply(D[second]).sum(axis=1) / square[of]
-        goes = square[second] - slope**2 * square[of] <= np.copysign(parallel**2, parallel) * square[of]
-        acts = square > 0.0
-        acts[second[goes]] = False
-        lead = np.flatnonzero(acts)
-        return lead, np.searchsorted(lead, of[goes]), second[goes], slope[goes]
+        """Rows that are kept; others, the kept one of the same node that each goes with, and in what proportion."""
+        system, D, m = self._system, self._D, np.count_nonzero(self._pressed)
+        is_force = self._entries < system.n_forces
+        row = np.repeat(np.arange(len(is_force)), np.diff(D.indptr))
+        pressed, on_force = D.indices >= D.shape[1] - m, is_force[row]
+        if (pressed & on_force).any() and not on_force.all():
+            # by pressures as by displacements, each times a stiffness
+            scale = np.max(np.abs(D.data[~on_force])) / np.max(np.abs(D.data[pressed & on_force]))
+            D = scipy.sparse.csr_array((np.where(pressed, scale, 1.0) * D.data, D.indices, D.indptr), shape=D.shape)
+        square = np.bincount(row, D.data**2, len(is_force))
+        acts = is_force & (square > 0.0)
+        on = np.flatnonzero(acts)
+        node = system.node[self._entries[on]]
+        by_node = np.lexsort((self._entries[on], -square[on], node))  # the largest row of each first
+        first = np.diff(node[by_node], prepend=-1) != 0
+        largest = np.maximum.accumulate(np.where(first, np.arange(len(on)), 0))
+        other, to = on[by_node[~first]], on[by_node[largest[~first]]]
+        slope = D[other].multiply(D[to]).sum(axis=1) / square[to]
+        goes = square[other] - slope**2 * square[to] <= np.copysign(parallel**2, parallel) * square[to]
+        acts[other[goes]] = False
+        return np.flatnonzero(acts), other[goes], to[goes], slope[goes]
 
-    def _image(self, D: Any, f: Array, p: Array) -> Array:
-        """Rows of D by the displacements of some forces, and by pressures."""
-        f, p = f.astype(self._dtype), p.astype(self._dtype)
-        u = [C @ f[columns] for C, columns in zip(self._C, self._columns, strict=True)]
-        return np.asarray(D @ np.concatenate([-u[0], -u[1], p]))
+    def _correct(self, F: Array) -> tuple[Array, Array]:
+        """Forces and multipliers whose image is nearly F, and their image."""
+        n, kept = self._n, self._kept
+        F = F.astype(self._dtype)  # a copy
+        F[self._follower] -= self._slope * F[self._two]
+        by_h = [F[others] @ C_h for _, others, _, C_h in self._parts]
+        w = self._B @ np.concatenate(by_h)
+        w[:n] -= F[:n]
+        w[n:] = F[n:kept] - w[n:]
+        w = self._getrs(*self._lu, w, trans=1, overwrite_b=True)[0]
+        u = [of_h - w[leads] @ C_E for of_h, (leads, _, C_E, _) in zip(by_h, self._parts, strict=True)]
+        x = np.concatenate([w, -F[kept:]])
+        x[self._follower] += self._slope * w[self._two]
+        image = self._D @ np.concatenate([*u, w[n:]])
+        image[:n] -= x[:n]
+        image[kept:] -= x[kept:]
+        return x, image
+
+    def _improve(self, F: Array, tolerance: float) -> tuple[Array, Array]:
+        """Forces and multipliers by GCR, which takes them where their image is closest to F, and what is left of F."""
+        x, Z, Q, square = np.zeros(len(F)), *np.empty((2, self.STALE, len(F))), np.empty(self.STALE)
+        for k in range(self.STALE):
+            Z[k], Q[k] = self._correct(F)
+            along = (Q[:k] @ Q[k]) / square[:k]
+            Z[k] -= along @ Z[:k]
+            Q[k] -= along @ Q[:k]
+            square[k] = Q[k] @ Q[k]
+            step = (Q[k] @ F) / square[k]
+            x += step * Z[k]
+            F = F - step * Q[k]
+            if np.sqrt(F @ F) <= tolerance:
+                break
+        return x, F
+
+    def _image(self, v: Array) -> Array:
+        n_f = self._system.n_forces
+        read = np.concatenate([self._system.displacements(v[:n_f]), v[n_f:]])
+        out = self._diagonal * v
+        out[n_f:][self._pressed] = 0.0  # these stand in D
+        out[self._entries] += self._D @ read[self._cols].astype(self._dtype)
+        return out
 
     def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """The tangent by a vector whose forces are among those involved."""
+        """The tangent by a vector."""
         into = y.array
-        if not self._system.on_root:
-            return
-        v = x.array_r[1:]
-        f = v[self._forces]
-        image = self._image(self._D, f, v[self._pressures])
-        into[0] = x.array_r[0]
-        into[1:] = self._diagonal * v
-        into[1 + self._forces] = image[: len(f)] - f
-        into[1 + self._pressures] = image[len(f) :]
+        if self._system.on_root:
+            into[0] = x.array_r[0]
+            into[1:] = self._image(x.array_r[1:])
 
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Solve nearly."""
+        """Solve."""
         into = y.array
         if not self._system.on_root:
             return
-        self._applied += 1
-        if self._applied > self.STALE and not self._fresh:
-            self._factor(self.PARALLEL)
-            self._fresh = True
-        if self._applied == 4 * self.STALE + 1:
-            self._factor(-1.0)
+        pc.setFailedReason(PETSc.PC.FailedReason.NOERROR)
         F = b.array_r[1:]
-        out = F / np.where(self._diagonal != 0.0, self._diagonal, 1.0)
-        if self._lu:
-            f, p = F[self._forces], F[self._pressures]
-            n = len(self._lead)
-            rhs = -self._image(self._D_kept, f, np.zeros(len(p)))
-            rhs[n:] = p - rhs[n:]
-            w = scipy.linalg.lu_solve(self._lu, rhs, trans=1, check_finite=False)
-            u = -f
-            u[self._lead] += w[:n]
-            u[self._follower] += self._slope * w[self._two]
-            out[self._forces] = u
-            out[self._pressures] = w[n:]
+        x = np.where(self._acts, 0.0, F / np.where(self._acts, 1.0, self._diagonal))  # where nothing acts
+        left = F - self._image(x) if x.any() else F.copy()
+        tolerance = self._rtol * np.linalg.norm(F)
+        turn = 0
+        while np.linalg.norm(left[self._entries]) > tolerance:
+            if turn == 1 and not self._fresh:
+                self._factor(self.PARALLEL)
+            if turn == 3:
+                self._factor(-1.0)
+            if turn == 4:
+                pc.setFailedReason(PETSc.PC.FailedReason.SUBPC_ERROR)
+                break
+            step, left[self._entries] = self._improve(left[self._entries], tolerance)
+            x[self._entries] += step
+            turn += 1
         into[0] = b.array_r[0]
-        into[1:] = out
+        into[1:] = x
 
 
 def _place_in(values: Index, wanted: Index) -> Index:

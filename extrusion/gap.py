@@ -60,6 +60,25 @@ class Surface:
         first = np.sort(np.unique(along, return_index=True)[1])
         return np.asarray(along[first])
 
+    @cached_property
+    def trace(self) -> Array:
+        """The cell's functions along the facet, then their derivatives, by powers of xi: ``shape=(m, k, 2 K)``."""
+        m, k = self.nodes.shape
+        out = np.zeros((m, k, 2, self.cell_nodes.shape[1]))
+        out[np.arange(m)[:, None], :, :, self.local] = SHAPES[k][:, :2].transpose(2, 0, 1)
+        return out.reshape(m, k, -1)
+
+    @cached_property
+    def gradients(self) -> Array:
+        """Gradients of the cell's functions along the facet, by powers of xi, 1/mm: ``shape=(m, k - 1, K, 2)``."""
+        assert self.tabulate is not None
+        m, k = self.nodes.shape
+        ends = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[self.facet_vertices]
+        at = shape(np.array([0.0, 1.0, 0.5][:k]), 2) @ ends
+        table = self.tabulate(1, at.reshape(-1, 2))[1:].reshape(2, m, k, -1)
+        K = np.linalg.inv(np.swapaxes(self.cell_X[:, 1:] - self.cell_X[:, :1], 1, 2))  # K[m, i, j] = d X_i(ref) / d x_j
+        return np.einsum("ak,imkl,mij->malj", SHAPES[k][:-1, 0], table, K)
+
     def reversed(self) -> Surface:
         """The same facets in the opposite order, each with start and end exchanged."""
         swap = [1, 0, *range(2, self.nodes.shape[1])]
@@ -90,18 +109,30 @@ def polyline(points: Array, first_node: int, side: float) -> Surface:
     return Surface(points[pair], nodes, nodes, np.broadcast_to([0, 1], nodes.shape), points[pair], pair * 0, side)
 
 
+SHAPES = {
+    2: np.array([[[1.0, 0], [-1, 1], [0, 0]], [[-1, 1], [0, 0], [0, 0]]]),
+    3: np.array(
+        [
+            [[1.0, 0, 0], [-3, -1, 4], [4, 4, -8]],
+            [[-3, -1, 4], [4, 4, -8], [0, 0, 0]],
+            [[2, 2, -4], [0, 0, 0], [0, 0, 0]],
+        ]
+    ),
+}
+"""Lagrange functions on [0, 1] for nodes start, end(, middle): by powers of xi, then values and two derivatives."""
+
+
+def polynomial(xi: Array, rows: Array) -> Array:
+    """Sum of ``xi ** j rows[..., j, :]``, ``shape=(*xi.shape, n)``; rows may have xi's axes in front, too."""
+    out = rows[..., -1, :]
+    for j in range(rows.shape[-2] - 2, -1, -1):
+        out = rows[..., j, :] + xi[..., None] * out
+    return np.asarray(out)
+
+
 def shape(xi: Array, k: int, derivative: int = 0) -> Array:
     """Lagrange functions on [0, 1] for nodes start, end(, middle): values or a derivative, ``shape=(*xi.shape, k)``."""
-    one, zero = np.ones_like(xi), np.zeros_like(xi)
-    if k == 2:
-        table = [(1 - xi, xi), (-one, one), (zero, zero)]
-        return np.stack(table[derivative], axis=-1)
-    table3 = [
-        ((1 - xi) * (1 - 2 * xi), xi * (2 * xi - 1), 4 * xi * (1 - xi)),
-        (4 * xi - 3, 4 * xi - 1, 4 - 8 * xi),
-        (4 * one, 4 * one, -8 * one),
-    ]
-    return np.stack(table3[derivative], axis=-1)
+    return polynomial(xi, SHAPES[k][:, derivative])
 
 
 @cache
@@ -112,19 +143,23 @@ def gauss(order: int) -> tuple[Array, Array]:
 
 
 def invert(values: Array, target: Array) -> Array:
-    """The xi in [0, 1] at which the curve with nodal ``values`` (n, k) passes ``target`` (n,), which its ends enclose.
+    """The xi in [0, 1] at which curves with nodal ``values`` (.., k) pass ``target`` (..), which their ends enclose.
 
     The root nearest the middle where the target is not enclosed (an iterate gone astray).
     """
-    start, end = values[:, 0], values[:, 1]
-    if values.shape[1] == 2:
-        return np.asarray((target - start) / (end - start))
-    middle = values[:, 2]
-    a, b, c = 2 * (start + end - 2 * middle), 4 * middle - 3 * start - end, start - target
+    return _root(np.moveaxis(values @ SHAPES[values.shape[-1]][:, 0].T, -1, 0), target)
+
+
+def _root(powers: Array, target: Array) -> Array:
+    """The same from the factors of xi's powers, ``shape=(k, ..)``."""
+    b, c = powers[1], powers[0] - target
+    if len(powers) == 2:
+        return np.asarray(-c / b)
+    a = powers[2]
     q = -0.5 * (b + np.copysign(np.sqrt(np.maximum(b * b - 4 * a * c, 0.0)), b))
     with np.errstate(divide="ignore", invalid="ignore"):
-        roots = np.nan_to_num(np.stack([c / q, q / a]), nan=np.inf, posinf=np.inf, neginf=np.inf)
-    return np.asarray(np.where(np.abs(roots[0] - 0.5) <= np.abs(roots[1] - 0.5), roots[0], roots[1]))
+        one, other = c / q, q / a
+    return np.asarray(np.where(np.abs(one - 0.5) <= np.abs(other - 0.5), one, other))
 
 
 @dataclass(frozen=True)
@@ -201,103 +236,91 @@ def ray_points(
     resting = 1e-12 * np.abs(vertex_p).max()  # a vertex this close to a facet's end is there, and cuts no sliver off
     low = np.searchsorted(vertex_p, ends.min(axis=1) + resting, side="right")
     high = np.searchsorted(vertex_p, ends.max(axis=1) - resting, side="left")
-    cuts = np.maximum(high - low, 0)
-    facet = np.repeat(np.arange(len(xs)), cuts + 1)
-    nth = np.arange(len(facet)) - np.repeat(np.cumsum(cuts + 1) - (cuts + 1), cuts + 1)
-    # die facet opposite the piece (-1 and m: the extensions), and the vertices at its two ends
-    opposite = np.where(forward[facet], low[facet] + nth - 1, high[facet] - nth - 1)
-    vertex0 = np.where(forward[facet], opposite, opposite + 1)
-    vertex1 = np.where(forward[facet], opposite + 1, opposite)
-    cut_left, cut_right = nth > 0, nth < cuts[facet]
-    xi0, xi1 = np.zeros(len(facet)), np.ones(len(facet))
-    xi0[cut_left] = invert(xs[facet[cut_left], :, p], vertex_p[vertex0[cut_left]])
-    xi1[:-1][cut_right[:-1]] = xi0[1:][cut_right[:-1]]
+    pieces = np.maximum(high - low, 0) + 1
+    facet = np.repeat(np.arange(len(xs)), pieces)
+    nth = np.arange(len(facet)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    # die facet opposite the piece (-1 and m: the extensions)
+    opposite = np.where(forward, low, high)[facet] - 1 + np.where(forward, 1, -1)[facet] * nth
     m = len(xd)
     e = np.clip(opposite, 0, m - 1)
     after = opposite >= m
     outside = (after | (opposite < 0))[:, None]
+    k_s, k_d = slave.nodes.shape[1], die.nodes.shape[1]
+    # by powers of place: x_s, x_s', N, N'; x_d, x_d', x_d'', M, M'
+    n_cell = slave.cell_nodes.shape[1]
+    of_s = np.concatenate([(SHAPES[k_s][:, :2].reshape(-1, k_s) @ xs).reshape(-1, k_s, 4), slave.trace], axis=2)
+    M = np.broadcast_to(SHAPES[k_d][:, :2].reshape(k_d, -1), (m, k_d, 2 * k_d))
+    of_d = np.concatenate([(SHAPES[k_d].reshape(-1, k_d) @ xd).reshape(-1, k_d, 6), M], axis=2)
+    # the cuts: pieces that begin there, and the vertex
+    begin = np.flatnonzero(nth)
+    f = facet[begin]
+    vertex = opposite[begin] + ~forward[f]
+    cut_s = of_s[f]
+    xi_cut = _root(cut_s[..., p].T, vertex_p[vertex])
+    xi0, xi1 = np.zeros(len(facet)), np.ones(len(facet))
+    xi0[begin] = xi1[begin - 1] = xi_cut
 
     # 2. points and weights on the reference slave facet
     s, omega = gauss(order)
     width = xi1 - xi0
     xi = xi0[:, None] + width[:, None] * s
-    X, t = slave.X[facet], slave.X[facet, 1] - slave.X[facet, 0]
+    start, t = slave.X[facet, 0, :1], (slave.X[:, 1, :1] - slave.X[:, 0, :1])[facet]
     length = slave.length[facet][:, None]
-    radius = X[:, :1, 0] + xi * t[:, :1]
-    jacobian = 2 * np.pi * radius * length if axisymmetric else np.broadcast_to(length, xi.shape)
-    weight = width[:, None] * omega * jacobian
+    measure = width[:, None] * omega
+    jacobian = 2 * np.pi * (start + xi * t) * length if axisymmetric else np.broadcast_to(length, xi.shape)
 
     # 3. the gap and its derivative at fixed xi
-    k_s, k_d = slave.nodes.shape[1], die.nodes.shape[1]
-    xs, xd = xs[facet], xd[e]
-    N, dN = shape(xi, k_s), shape(xi, k_s, 1)
-    x_s, dx_s = N @ xs, dN @ xs
-    if k_d == 2:
-        k = (x_s[..., p] - xd[:, :1, p]) / (xd[:, 1, p] - xd[:, 0, p])[:, None]
-    else:
-        repeated = np.repeat(xd[:, :, p], order, axis=0)
-        k = invert(repeated, x_s[..., p].ravel()).reshape(xi.shape)
-    k = np.where(outside, np.where(after, 1.0, 0.0)[:, None], k)
-    M, dM, ddM = (shape(k, k_d, i) for i in range(3))
-    x_d, dx_d, ddx_d = M @ xd, dM @ xd, ddM @ xd
+    at = polynomial(xi, of_s[facet][:, None])
+    x_s, dx_s, N, dN = at[..., :2], at[..., 2:4], at[..., 4 : 4 + n_cell], at[..., 4 + n_cell :]
+    path = of_d[e]
+    k = np.where(outside, after[:, None], _root(path[..., p].T[..., None], x_s[..., p]))
+    at = polynomial(k, path[:, None])
+    x_d, dx_d, ddx_d, M, dM = at[..., :2], at[..., 2:4], at[..., 4:6], at[..., 6 : 6 + k_d], at[..., 6 + k_d :]
     slope = np.where(outside, _reference_slope(die, axis)[e][:, None], dx_d[..., c] / dx_d[..., p])
     excess = np.where(outside, x_s[..., p] - x_d[..., p], 0.0)
     gap = sign * (x_d[..., c] + slope * excess - x_s[..., c])
-
-    n_cell = slave.cell_nodes.shape[1]
-    n_local = 2 * (n_cell + k_d)
-    cols = np.concatenate([_dofs(slave.cell_nodes[facet]), _dofs(die.nodes[e])], axis=1)
-    where = slave.local[facet][:, None, :]
-
-    def rows(slave_values: Array | None, die_values: Array | None, component: int) -> Array:
-        out = np.zeros((*xi.shape, n_local))
-        if slave_values is not None:
-            np.put_along_axis(out, np.broadcast_to(2 * where + component, slave_values.shape), slave_values, axis=2)
-        if die_values is not None:
-            out[..., 2 * n_cell + component :: 2] = die_values
-        return out
-
-    dp = dx_d[..., p, None]
+    both = np.concatenate([-N, M], axis=2)
     s_ = slope[..., None]
-    a = rows(N, -M, p)
-    G = sign * (rows(-N, M, c) + s_ * a)
+    # rows over nodes and components; a has only the component p, as have the derivatives of place and weight
+    rows = np.zeros((6 if variation else 1, *both.shape, 2))
+    G = rows[0]
+    G[..., c] = sign * both
+    G[..., p] = -s_ * G[..., c]
+    flat = rows.reshape(len(rows), *xi.shape, -1)
+    cols = _dofs(np.concatenate([slave.cell_nodes[facet], die.nodes[e]], axis=1))
     points = dict(
-        facet=facet, die=e, cols=cols, xi=xi, weight=weight, gap=gap, G=G, slope=slope,
+        facet=facet, die=e, cols=cols, xi=xi, weight=measure * jacobian, gap=gap, G=flat[0], slope=slope,
         past=np.broadcast_to(outside, xi.shape),
     )  # fmt: skip
     if not variation:
         return Points(**points)
 
-    # 4. second variation at fixed xi, variation of the split points, and of the points and weights they carry
-    kappa = np.where(outside, 0.0, (ddx_d[..., c] - slope * ddx_d[..., p]) / dx_d[..., p] ** 2)[..., None]
-    turning = np.where(outside[..., None], 0.0, dM / dp)
-    b = rows(None, turning, c) + rows(None, -s_ * turning, p)
-    dxs_p = dx_s[..., p, None]
-    G_xi = sign * (rows(-dN, None, c) + s_ * rows(dN, None, p) + dxs_p * (b + kappa * a))
+    # 4. second variation at fixed xi; there b is half of kappa a more, so that l (x) r = a (x) b + b (x) a
+    _, G_xi, a, b, dxi, dweight = rows
+    kappa = np.where(outside, 0.0, (ddx_d[..., c] - slope * ddx_d[..., p]) / dx_d[..., p] ** 2)
+    turning = np.where(outside[..., None], 0.0, dM / dx_d[..., p, None])
+    G_xi[..., c] = sign * np.concatenate([-dN, dx_s[..., p, None] * turning], axis=2)
+    G_xi[..., p] = -s_ * G_xi[..., c] - (sign * dx_s[..., p] * kappa)[..., None] * both
     gap_xi = sign * (slope * dx_s[..., p] - dx_s[..., c])
+    a[..., p] = -both
+    b[..., n_cell:, c] = sign * turning
+    b[..., p] = (-0.5 * sign * kappa)[..., None] * both
+    b[..., n_cell:, p] -= s_ * b[..., n_cell:, c]
 
-    def split_row(xi_end: Array, cut: NDArray[np.bool_], vertex: Index) -> Array:
-        N_end = shape(xi_end, k_s)
-        speed = np.where(cut, np.einsum("ni,ni->n", shape(xi_end, k_s, 1), xs[:, :, p]), 1.0)
-        out = np.zeros((len(xi_end), n_local))
-        np.put_along_axis(out, 2 * where[:, 0] + p, -N_end, axis=1)
-        die_node = np.clip(vertex - e, 0, 1)
-        np.put_along_axis(out, (2 * (n_cell + die_node) + p)[:, None], 1.0, axis=1)
-        return np.where(cut[:, None], out / speed[:, None], 0.0)
-
-    d0, d1 = split_row(xi0, cut_left, vertex0), split_row(xi1, cut_right, vertex1)
-    dxi = d0[:, None, :] * (1 - s)[:, None] + d1[:, None, :] * s[:, None]
-    dweight = (omega * jacobian)[..., None] * (d1 - d0)[:, None, :]
+    # 5. variation of the split points, and of the points and weights they carry
+    cut = np.zeros((2, len(facet), both.shape[2]))  # of the pieces' beginnings and ends
+    at = polynomial(xi_cut, cut_s)
+    speed = at[:, 2 + p, None]
+    for moved, piece in zip(cut, (begin, begin - 1), strict=True):
+        moved[piece, :n_cell] = at[:, 4 : 4 + n_cell] / -speed
+        moved[piece, n_cell + (vertex > e[piece])] = 1 / speed[:, 0]
+    wider = (cut[1] - cut[0])[:, None]
+    dxi[..., p] = cut[0][:, None] + s[:, None] * wider
+    dweight[..., p] = (omega * jacobian)[..., None] * wider
     if axisymmetric:
-        dweight = dweight + (width[:, None] * omega * 2 * np.pi * t[:, :1] * length)[..., None] * dxi
-    return Points(
-        **points,
-        gap_xi=gap_xi,
-        G_xi=G_xi,
-        curvature=((sign * a, b), (sign * b, a), (sign * kappa * a, a)),
-        dxi=dxi,
-        dweight=dweight,
-    )
+        dweight[..., p] += (2 * np.pi * measure * t * length)[..., None] * dxi[..., p]
+    _, G_xi, a, b, dxi, dweight = flat
+    return Points(**points, gap_xi=gap_xi, G_xi=G_xi, curvature=((a, b), (b, a)), dxi=dxi, dweight=dweight)
 
 
 def least_gap(slave: Surface, die: Surface, z: Array, axis: int, sign: float) -> float:
@@ -343,52 +366,35 @@ def stress_rows(
         Rows ``shape=(n, q, 2 K)`` in MPa/mm (and 3 more, over the pressures, if the surface has them), and their
         derivative or None.
     """
-    assert slave.tabulate is not None
-    reference = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    ends = reference[slave.facet_vertices[facet]]  # (n, 2, 2)
-    tangent = ends[:, 1] - ends[:, 0]
-    at = ends[:, None, 0] + xi[..., None] * tangent[:, None]
-    table = slave.tabulate(2 if variation else 1, at.reshape(-1, 2)).reshape(-1, *xi.shape, slave.cell_nodes.shape[1])
-    vertices = slave.cell_X[facet]
-    J = np.stack([vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0]], axis=2)
-    K = np.linalg.inv(J)  # K[n, i, j] = d X_i(ref) / d x_j
-    phi = table[0]
-    grad = np.einsum("inqk,nij->nqkj", table[1:3], K)
+    mixed, K = slave.pressure_cols is not None, slave.cell_nodes.shape[1]
     N = slave.normal[facet][:, None]
-    d = np.broadcast_to(direction, (*xi.shape, 2))
-
-    mixed = slave.pressure_cols is not None
+    d = np.broadcast_to(direction, np.broadcast_shapes(np.shape(direction), N.shape))
     along_N = np.einsum("nqi,nqi->nq", d, np.broadcast_to(N, d.shape))[..., None]
-    bulk = 0.0 if mixed else lmbda
-
-    def combine(value: Array | None, gradient: Array, pressure: Array) -> Array:
-        divergence = gradient.copy()
-        if value is not None:
-            divergence[..., 0] += value
-        along_d = np.einsum("nqkj,nqj->nqk", gradient, d)[..., None]
-        along_n = np.einsum("nqkj,nqj->nqk", gradient, np.broadcast_to(N, d.shape))[..., None]
-        S = bulk * along_N[..., None] * divergence + mu * (along_d * N[:, :, None] + along_n * d[:, :, None])
-        S = S.reshape(*xi.shape, -1)
-        return np.concatenate([S, -mu * along_N * pressure], axis=2) if mixed else np.asarray(S)
-
-    start, t = slave.X[facet, 0], slave.X[facet, 1] - slave.X[facet, 0]
-    r = (start[:, :1] + xi * t[:, :1])[..., None]
-    barycentric = np.stack([1 - at[..., 0] - at[..., 1], at[..., 0], at[..., 1]], axis=-1)
-    rows = combine(phi / r if axisymmetric else None, grad, barycentric)
-    if not variation:
-        return rows, None
-    # second derivatives along the facet: table[3:6] are xx, xy, yy in reference coordinates
-    along = np.stack(
-        [
-            table[3] * tangent[:, None, None, 0] + table[4] * tangent[:, None, None, 1],
-            table[4] * tangent[:, None, None, 0] + table[5] * tangent[:, None, None, 1],
-        ]
-    )
-    grad_xi = np.einsum("inqk,nij->nqkj", along, K)
-    phi_xi = np.einsum("inqk,ni->nqk", table[1:3], tangent)
-    hoop_xi = phi_xi / r - phi * t[:, None, :1] / r**2 if axisymmetric else None
-    barycentric_xi = np.stack([-tangent.sum(axis=1), tangent[:, 0], tangent[:, 1]], axis=-1)
-    return rows, combine(hoop_xi, grad_xi, np.broadcast_to(barycentric_xi[:, None], barycentric.shape))
+    # what the gradient gives, by powers of xi
+    g = slave.gradients[facet][:, None]
+    along_d = np.einsum("nqjki,nqi->nqjk", np.broadcast_to(g, (*d.shape[:2], *g.shape[2:])), d)
+    along_n = np.einsum("nqjki,nqi->nqjk", g, N)
+    S = mu * (along_d[..., None] * N[:, :, None, None] + along_n[..., None] * d[:, :, None, None])
+    if not mixed:
+        S += lmbda * along_N[..., None, None] * g
+    S = S.reshape(*S.shape[:3], -1)
+    rows = np.zeros((1 + variation, *xi.shape, 2 * K + 3 * mixed))
+    rows[0, ..., : 2 * K] = polynomial(xi, S)
+    if variation and S.shape[2] == 2:
+        rows[1, ..., : 2 * K] = S[:, :, 1]
+    # what the pressure gives, or the hoop strain
+    if mixed:
+        ends = np.eye(3)[slave.facet_vertices[facet]]
+        for derivative in range(1 + variation):
+            rows[derivative, ..., 2 * K :] = -mu * along_N * (shape(xi, 2, derivative) @ ends)
+    elif axisymmetric:
+        start, t = slave.X[facet, 0, :1], (slave.X[:, 1, :1] - slave.X[:, 0, :1])[facet]
+        r = (start + xi * t)[..., None]
+        phi, phi_xi = np.split(polynomial(xi, slave.trace[facet][:, None]) * (lmbda * along_N / r), 2, axis=2)
+        rows[0, ..., : 2 * K : 2] += phi
+        if variation:
+            rows[1, ..., : 2 * K : 2] += phi_xi - phi * (t[:, None] / r)
+    return rows[0], rows[1] if variation else None
 
 
 KEPT = 0.02

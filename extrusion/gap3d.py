@@ -700,7 +700,7 @@ def closest(die: Facets | Revolved, z: Array, x: Array, smooth: bool = False, ke
         gap = np.einsum("ni,ni->n", found.normal, flat - at)
         return Closest(found.facet, gap, normal, None, found.past)
     xd, kd = die.position(z), die.nodes.shape[1]
-    candidates = _near(die, xd, x)
+    candidates: Any = _near(die, xd, x)
     n, c = candidates.shape
     flat_c = candidates.ravel()
     nodes, many = xd[flat_c], np.repeat(x, c, axis=0)

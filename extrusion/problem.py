@@ -45,6 +45,7 @@ from extrusion.system import System, in_words
 from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact
 
 if TYPE_CHECKING:
+    from extrusion.krylov import Krylov
     from extrusion.mesh3d import HexMesh
 
 log = logging.getLogger(__name__)
@@ -94,6 +95,7 @@ class Problem(System):
         self._find_supports()
         self._gather_contact()
         self._lay_out()
+        self._krylov: Krylov | None = None
         if case.method == "nitsche" and case.theta != -1:
             self._refuse_indefinite()
 
@@ -411,6 +413,11 @@ class Problem(System):
         z = self.gather(x)
         parts = [term.tangent(z, geometric) for term in self.terms]
         rows, cols, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+        if self._krylov is not None:
+            stiff = [term.stiff(z) for term in self.terms]
+            triplets = (np.concatenate(part) for part in zip(*(part for part, _ in stiff), strict=True))
+            i, j, v = triplets
+            return self._krylov.set((rows, cols, values), (i, j, v), np.concatenate([kappa for _, kappa in stiff]))
         keep = self._z_row[rows] & self.z_free[cols]
         return self._tangent.fill(self.z_to_x[rows[keep]] - self._row0, self.z_to_x[cols[keep]], values[keep])
 
@@ -422,9 +429,82 @@ class Problem(System):
     def forget_pattern(self) -> None:
         """Let go of the contact pairs met so far: the tangent's pattern is the bulk's again."""
         self._tangent.reset()
+        if self._krylov is not None:
+            self._displacements_only.reset()
+
+    def set_accuracy(self, ksp: PETSc.KSP, tolerance: float, rough: bool) -> None:
+        """No more of it than Newton's method, which ends at this residual, can use."""
+        if self._krylov is not None:
+            from extrusion.krylov import ROUGH_RTOL, RTOL
+
+            ksp.setTolerances(rtol=ROUGH_RTOL if rough else RTOL, atol=0.3 * tolerance, max_it=400)
+
+    def iterate(self) -> None:
+        """From now on solve the tangent's linear systems by a Krylov method instead of factoring them."""
+        from extrusion.krylov import Krylov
+
+        self._krylov = Krylov(self)
+
+    def agreed(self, yes: bool) -> bool:
+        """Whether all ranks say yes."""
+        return bool(self.comm.allreduce(yes, op=MPI.LAND)) if self.comm.size > 1 else yes
+
+    @property
+    def z_rows(self) -> Index:
+        """Entries of z that are unknowns of this rank."""
+        return self._z_mine[self._z_row[self._z_mine]]
+
+    @cached_property
+    def x_rows(self) -> Index:
+        """Where this rank's x holds them."""
+        return self._x_mine[self._z_row[self._z_mine]]
+
+    def bulk_times(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """K x into y; at the supports x itself."""
+        self._K_wide.mult(x, y)
+        y.array[self._held] = x.array_r[self._held]
+
+    def stiffened(self, stiff: tuple[Index, Index, Array]) -> PETSc.Mat:
+        """The bulk, identity-like at the supports, plus triplets over the displacements in z; no multipliers."""
+        rows, cols, values = stiff
+        keep = self._z_row[rows]
+        return self._displacements_only.fill(
+            self.z_to_x[rows[keep]] - self._row0, self.z_to_x[cols[keep]], values[keep]
+        )
+
+    @cached_property
+    def _displacements_only(self) -> TangentMatrix:
+        indptr, indices, data = self.K.getValuesCSR()
+        n = self.n - self.n_multipliers
+        held = self.held[self.held < n]
+        return TangentMatrix(self.comm, self._owned, n, self._row0, indptr, indices, data, held, self.dim)
+
+    def gather_displacements(self, u: PETSc.Vec) -> Array:
+        """Displacements in z of a vector without multipliers, on every rank."""
+        self._to_z_of_u.scatter(u, self._z_u, addv=False, mode="forward")
+        z = np.zeros(self.n_z - self.n_multipliers)
+        z[self._z_live[: self._z_u.local_size]] = self._z_u.array_r
+        return z
+
+    @cached_property
+    def _z_u(self) -> PETSc.Vec:
+        return PETSc.Vec().createSeq(len(self._z_live) - self.n_multipliers)
+
+    @cached_property
+    def _to_z_of_u(self) -> PETSc.Scatter:
+        u = PETSc.Vec().createMPI((self._owned, PETSc.DETERMINE), comm=self.comm)
+        taken = self.z_to_x[self._z_live[: self._z_u.local_size]].astype(PETSc.IntType)
+        return PETSc.Scatter().create(u, PETSc.IS().createGeneral(taken, comm=PETSc.COMM_SELF), self._z_u, None)
 
     def set_solver(self, ksp: PETSc.KSP) -> None:
-        """MUMPS, anew for each tangent."""
+        """MUMPS, anew for each tangent; or the Krylov method."""
+        if self._krylov is not None:
+            ksp.setType("fgmres")
+            ksp.setGMRESRestart(60)
+            pc = ksp.getPC()
+            pc.setType("python")
+            pc.setPythonContext(self._krylov)
+            return
         ksp.setType("preonly")
         pc = ksp.getPC()
         pc.setType("lu")
@@ -436,6 +516,8 @@ class Problem(System):
 
     def tangent_without_contact(self) -> PETSc.Mat:
         """The bulk's tangent, with identity at the supports (and nothing yet for the multipliers)."""
+        if self._krylov is not None:
+            return self._krylov.A
         none = np.zeros(0, dtype=np.int64)
         return self._tangent.fill(none, none, np.zeros(0))
 
@@ -642,7 +724,9 @@ class TangentMatrix:
         indices: Index,
         data: Array,
         held: Index,
+        block: int = 1,
     ) -> None:
+        self._block = block
         self._comm, self._n_local, self._n, self._row0 = comm, n_local, n, row0
         self._A: PETSc.Mat | None = None
         rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
@@ -675,7 +759,7 @@ class TangentMatrix:
     def _create(self) -> PETSc.Mat:
         rows, cols = self._keys // self._n + self._row0, self._keys % self._n
         A = PETSc.Mat().create(self._comm)
-        A.setSizes(((self._n_local, self._n), (self._n_local, self._n)))
+        A.setSizes(((self._n_local, self._n), (self._n_local, self._n)), bsize=self._block)
         A.setType("aij")
         A.setPreallocationCOO(rows.astype(PETSc.IntType), cols.astype(PETSc.IntType))
         return A

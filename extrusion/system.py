@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from mpi4py import MPI
@@ -12,7 +15,7 @@ import numpy as np
 
 from extrusion.cases import Case
 from extrusion.gap import Array, Index
-from extrusion.zones import ContactTerm, MortarContact
+from extrusion.zones import ContactTerm, MortarContact, Triplets
 
 
 class System(ABC):
@@ -28,6 +31,7 @@ class System(ABC):
     x: PETSc.Vec
     n_z: int
     n_multipliers: int
+    pairing = 0.0  # s, spent so far in finding contact points and evaluating the terms
 
     # -- unknowns --------------------------------------------------------------------------------------------
 
@@ -69,6 +73,15 @@ class System(ABC):
     def set_solver(self, ksp: PETSc.KSP) -> None:
         """Say how the tangent's linear systems are solved."""
 
+    def set_accuracy(self, ksp: PETSc.KSP, tolerance: float, rough: bool) -> None:  # noqa: B027
+        """Say how closely the next linear systems are to be solved, where that is a choice.
+
+        Args:
+            ksp: The solver.
+            tolerance: Of Newton's residual, N.
+            rough: Whether the equations will change before that is reached.
+        """
+
     @abstractmethod
     def tangent_without_contact(self) -> PETSc.Mat:
         """A matrix of the tangent's kind, before there is a tangent."""
@@ -83,9 +96,25 @@ class System(ABC):
     def contact_forces(self, z: Array) -> Array:
         """Contact's part of the residual over z, N (and multiplier rows)."""
         R = np.zeros(self.n_z)
-        for term in self.terms:
-            term.add_residual(z, R)
+        with self._pairs():
+            for term in self.terms:
+                term.add_residual(z, R)
         return R
+
+    def contact_tangent(self, z: Array, geometric: bool) -> Triplets:
+        """Its derivative as (rows, columns, values); ``geometric`` adds the second variation of the gap."""
+        with self._pairs():
+            parts = [term.tangent(z, geometric) for term in self.terms]
+        rows, cols, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return rows, cols, values
+
+    @contextmanager
+    def _pairs(self) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.pairing += time.perf_counter() - began
 
     # -- contact state ---------------------------------------------------------------------------------------
 
@@ -98,8 +127,9 @@ class System(ABC):
     def pair_up(self, x: PETSc.Vec, settle: bool = False) -> None:
         """Pair billet and die anew at x, for terms that freeze their pairing."""
         z = self.gather(x)
-        for term in self.terms:
-            term.pair_up(z, settle)
+        with self._pairs():
+            for term in self.terms:
+                term.pair_up(z, settle)
 
     @property
     def may_settle(self) -> bool:
@@ -114,8 +144,9 @@ class System(ABC):
     def accept(self, x: PETSc.Vec) -> None:
         """Make x the accepted state of every zone."""
         z = self.gather(x)
-        for term in self.terms:
-            term.accept(z)
+        with self._pairs():
+            for term in self.terms:
+                term.accept(z)
 
     def hold(self, x: PETSc.Vec | None) -> None:
         """Stay with the die facets that are faced at x where a change of facet has a kink; None: let go."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import scipy.sparse
 
 from extrusion.contact import project
 from extrusion.elasticity import Elastic
@@ -48,6 +49,9 @@ class ContactTerm(Protocol):
 
     def hold(self, z: Array | None) -> None:
         """Near the solution: stay with the die facets that are faced at z, where they are not split; None: let go."""
+
+    def stiff(self, z: Array) -> tuple[Triplets, Array]:
+        """What the closed gap's penalty would add to the tangent, and that penalty of each multiplier."""
 
     def accept(self, z: Array) -> None:
         """Make z the accepted state."""
@@ -157,6 +161,13 @@ class NodalContact:
             np.concatenate([at.ravel(), self._cols.ravel(), self.at]),
             np.concatenate([self._G.ravel(), constraint.ravel(), dsc - 1.0]),
         )
+
+    def stiff(self, z: Array) -> tuple[Triplets, Array]:
+        if not self.multipliers:
+            return _none(), self._kappa[:0]
+        _, _, dsc = self._law(z)
+        J = np.einsum("n,ni,nj->nij", dsc * self._kappa, self._G, self._G)
+        return _triplets(self._cols, J), self._kappa
 
     def accept(self, z: Array) -> None:
         if not self.multipliers:
@@ -319,9 +330,16 @@ class IntegratedContact:
                 left.append(w_sc * a)
                 right.append(b)
         J = np.swapaxes(np.concatenate(left, axis=1), 1, 2) @ np.concatenate(right, axis=1)
-        rows = np.broadcast_to(points.cols[:, :, None], J.shape)
-        cols = np.broadcast_to(points.cols[:, None, :], J.shape)
-        return rows.ravel(), cols.ravel(), J.ravel()
+        return _triplets(points.cols, J)
+
+    def stiff(self, z: Array) -> tuple[Triplets, Array]:
+        if self.pair.closure == "check" or self.pair.is_far(z, self._radius):
+            return _none(), np.zeros(0)
+        points, S, _ = self._points(z)
+        _, _, dsc, k = self._law(z, points, S)
+        on = (dsc > 0).any(axis=1)
+        G, w = points.G[on], (points.weight * dsc * k)[on]
+        return _triplets(points.cols[on], np.swapaxes(w[..., None] * G, 1, 2) @ G), np.zeros(0)
 
     def closed_edge(self) -> tuple[Triplets, Array]:
         """What the symmetric method (theta = 1) adds to the bulk with every facet closed against a plane die.
@@ -529,6 +547,21 @@ class MortarContact:
         self._expects = on and self._accepted is not None
         return self._expects
 
+    def stiff(self, z: Array) -> tuple[Triplets, Array]:
+        kappa = self._k / self._total
+        if not self.multipliers or self.pair.is_far(z, self._radius):
+            return _none(), kappa[: self.multipliers]
+        points = self._points(z)
+        _, dsc, w = self._law(z, points)
+        psi = self.pair.hats(points)[0] * (w[..., None] * (dsc > 0)[self._ends[points.facet]][:, None])
+        weak = np.swapaxes(psi, 1, 2) @ points.G  # rows of the weak gap, piece by piece
+        rows = np.broadcast_to(self._ends[points.facet][..., None], weak.shape)
+        cols = np.broadcast_to(points.cols[:, None], weak.shape)
+        shape = len(self.closed), int(points.cols.max()) + 1
+        B = scipy.sparse.coo_array((weak.ravel(), (rows.ravel(), cols.ravel())), shape=shape).tocsr()
+        J = (B.T @ scipy.sparse.diags_array(kappa) @ B).tocoo()
+        return (J.row.astype(np.int64), J.col.astype(np.int64), J.data), kappa
+
     def accept(self, z: Array) -> None:
         if self.multipliers and self.pair.closure == "unilateral":
             dsc = self._law(z, self._points(z))[1]
@@ -553,6 +586,12 @@ class MortarContact:
 def _farthest(gap: Array, of: np.ndarray) -> float:
     """Largest distance from the die among some points, mm."""
     return float(np.max(np.abs(gap[of]), initial=0.0))
+
+
+def _triplets(cols: Index, J: Array) -> Triplets:
+    """Blocks over some columns as (rows, columns, values)."""
+    rows = np.broadcast_to(cols[:, :, None], J.shape)
+    return rows.ravel(), np.broadcast_to(cols[:, None, :], J.shape).ravel(), J.ravel()
 
 
 def _none() -> Triplets:
