@@ -37,7 +37,7 @@ from extrusion.cases import Case
 from extrusion.condensed import choose
 from extrusion.elasticity import epsilon, sigma
 from extrusion.errors import InputError, StepError
-from extrusion.estimate import GOALS, Error, Estimate, Goal, Part, continuous, reaction_scale
+from extrusion.estimate import GOALS, Error, Estimate, Goal, Part, continuous, reaction_scale, tell_space
 from extrusion.gap import Array
 from extrusion.mesh import PlainMesh, graded_mesh, on_root, sized_mesh
 from extrusion.newton import Newton
@@ -322,6 +322,7 @@ def adapt(
     if not isinstance(tolerance, int | float) or not math.isfinite(tolerance) or not 0 < tolerance < 1:
         raise InputError("tolerance", tolerance, "give a relative error between 0 and 1")
     scene = continuous(case)
+    tell_space(case, comm)
 
     def make() -> tuple[PlainMesh, Estimate] | str:
         mesh, parts = start or graded_mesh(case.profile, COARSEST * case.profile.radius), []

@@ -132,7 +132,7 @@ def solve(cell: Cell, mesh: str | None = None) -> Outcome:
     from extrusion.result import PICTURED
     from extrusion.stepping import Step, steps
 
-    case, started, base = cell.case(), time.monotonic(), _memory("VmRSS")
+    case, started, base = cell.case(), time.monotonic(), resident_memory("VmRSS")
     clock = [time.perf_counter()]
     plain = case_mesh(case.profile, case.size) if mesh is None else read_mesh(mesh)
     problem = Problem(case, plain, MPI.COMM_SELF)
@@ -140,7 +140,7 @@ def solve(cell: Cell, mesh: str | None = None) -> Outcome:
     system = choose(problem, cell.solver)
     newton = Newton(system)
     clock.append(time.perf_counter())
-    memory_factor, output, found, note = _memory("VmHWM"), 0.0, list[Step](), ""
+    memory_factor, output, found, note = resident_memory("VmHWM"), 0.0, list[Step](), ""
     try:
         for step in steps(system, newton, case.times()):
             found.append(step)
@@ -167,7 +167,7 @@ def solve(cell: Cell, mesh: str | None = None) -> Outcome:
         wall=time.monotonic() - started,
         base=base,
         memory_factor=memory_factor,
-        memory=_memory("VmHWM"),
+        memory=resident_memory("VmHWM"),
         compliance=getattr(system, "memory", 0.0) / 1e6,
         **({} if note else _errors(case, found)),
     )
@@ -191,7 +191,7 @@ def _errors(case: Case, found: Sequence[Any]) -> dict[str, float]:
     return out
 
 
-def _memory(name: str) -> float:
+def resident_memory(name: str) -> float:
     """This process's resident size (``VmRSS``), or its peak (``VmHWM``), MB; NaN where there is no ``/proc``.
 
     Not `resource.getrusage`, whose peak has that of the parent in it.
@@ -434,7 +434,7 @@ def report(here: dict[str, Any], runs: Sequence[tuple[Cell, Outcome]]) -> str:
     best = sorted((row for row in mine if any(id(row) in of for of in on.values())), key=lambda row: row["solve"])
     parts = [", ".join(f"{name} {value}" for name, value in here.items()) + "\n"]
     parts.append(
-        _markdown(
+        markdown(
             "method order mesh dofs iterations set-up factor condensation steps output s MB K_% R_% p_50_% best_in",
             [
                 [
@@ -453,7 +453,7 @@ def report(here: dict[str, Any], runs: Sequence[tuple[Cell, Outcome]]) -> str:
         )
     )
     parts.append(
-        _markdown(
+        markdown(
             "mesh dofs to_t pairs surface_s full_s full_/_surface least most surface_MB full_MB",
             [
                 [
@@ -470,7 +470,7 @@ def report(here: dict[str, Any], runs: Sequence[tuple[Cell, Outcome]]) -> str:
     if found:
         first, last = found[0]["dofs"]
         parts.append(
-            _markdown(
+            markdown(
                 f"quantity exponent last_decade at_{first}_dofs at_{last}_dofs",
                 [
                     [row["quantity"], *(f"{row[name]:.2f}" for name in ("exponent", "last_decade"))]
@@ -485,7 +485,14 @@ def report(here: dict[str, Any], runs: Sequence[tuple[Cell, Outcome]]) -> str:
     return "\n".join(parts)
 
 
-def _markdown(head: str, rows: Iterable[Sequence[str]], left: int = 1) -> str:
+def markdown(head: str, rows: Iterable[Sequence[str]], left: int = 1) -> str:
+    """A table in Markdown.
+
+    Args:
+        head: The columns' names, with _ for a space within one.
+        rows: Cells.
+        left: How many columns are aligned to the left.
+    """
     names = [name.replace("_", " ") for name in head.split()]
     rule = "|---" * left + "|---:" * (len(names) - left) + "|"
     return "\n".join([f"| {' | '.join(names)} |", rule, *(f"| {' | '.join(row)} |" for row in rows), ""])

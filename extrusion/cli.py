@@ -65,10 +65,11 @@ def _root(
 def list_cases() -> None:
     """List the built-in cases."""
     table = Table(box=SIMPLE_HEAD, padding=0)
-    for name in ("case", "title", "t up to\nmm", "figures"):
+    for name in ("case", "space", "title", "t up to\nmm", "figures"):
         table.add_column(name)
     for case in CASES.values():
-        table.add_row(case.name, case.title, f"{case.end:g}", str(len(case.figures)))
+        title = case.title[len(case.space) :].lstrip() if case.title.lower().startswith(case.space) else case.title
+        table.add_row(case.name, case.space, title, f"{case.end:g}", str(len(case.figures)))
     Console().print(table)
 
 
@@ -86,6 +87,14 @@ def run(
         float | None, typer.Option(metavar="MM", help="Element size on the billet's side of a graded mesh.")
     ] = None,
     mesh: Annotated[Path | None, typer.Option(metavar="FILE", help="Mesh (.msh, .med) in place of the case's.")] = None,
+    space: Annotated[
+        str | None, typer.Option(metavar="axisymmetric|3d", help="The half-plane, or a quarter in three dimensions.")
+    ] = None,
+    sectors: Annotated[int | None, typer.Option(metavar="N", help="In 3d: elements over the quarter turn.")] = None,
+    element: Annotated[
+        str | None,
+        typer.Option(metavar="lagrange|serendipity", help="In 3d with order 2: 27 or 20 nodes a hexahedron."),
+    ] = None,
     increment: Annotated[
         float | None, typer.Option(metavar="MM", help="Uniform increment, in place of the case's table.")
     ] = None,
@@ -97,7 +106,11 @@ def run(
     gamma: Annotated[float | None, typer.Option(help="Dimensionless contact stiffness.")] = None,
     theta: Annotated[int | None, typer.Option(metavar="-1|0|1", help="Variant of Nitsche's method.")] = None,
     solver: Annotated[
-        str, typer.Option(metavar="auto|surface|full", help="Newton's method on contact's forces, or on all unknowns.")
+        str,
+        typer.Option(
+            metavar="auto|surface|full|iterative",
+            help="Newton's method on contact's forces, or on all unknowns; iterative: these by multigrid, in 3d.",
+        ),
     ] = "auto",
     tolerance: Annotated[
         float | None,
@@ -117,8 +130,8 @@ def run(
 ) -> None:
     """Run a case; write tables, fields and pictures."""
     changes = dict(
-        method=method, order=order, die=die, contact=contact, size=size, mesh=mesh, increment=increment,
-        until=until, form=form, gamma=gamma, theta=theta,
+        method=method, order=order, die=die, contact=contact, size=size, mesh=mesh, space=space, sectors=sectors,
+        element=element, increment=increment, until=until, form=form, gamma=gamma, theta=theta,
     )  # fmt: skip
     given = {name for name, value in changes.items() if value is not None}
     logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, format="extrusion: %(message)s")
@@ -126,13 +139,13 @@ def run(
         for name in ("condensed", "estimate", "adapt"):
             logging.getLogger(f"extrusion.{name}").setLevel(logging.INFO)
     with _as_options(given | {"out", "json", "solver", "tolerance", "goal", "adapt"}):
-        from extrusion.result import changed
+        from extrusion.result import CHOSEN, changed
         from extrusion.result import run as solve
 
         if goal is not None and tolerance is None:
             raise InputError("goal", goal, "it is what a tolerance is of: give --tolerance too")
         if tolerance is not None:
-            for name in ("method", "order", "size", "mesh", "form", "gamma", "theta"):
+            for name in CHOSEN:
                 if name in given:
                     raise InputError(name, changes[name], "leave it out: with --tolerance the model is chosen")
         scene = changed(_load(case), **{**changes, "mesh": str(mesh) if mesh else None})
@@ -321,26 +334,52 @@ def bench(
 @app.command()
 def mesh(
     case: CaseName = "A",
+    dim: Annotated[
+        int | None, typer.Option(metavar="2|3", help="Triangles or hexahedra; by default what the case needs.")
+    ] = None,
     size: Annotated[
         float | None, typer.Option(metavar="MM", help="Element size on the billet's side; else the case's divisions.")
     ] = None,
+    sectors: Annotated[
+        int | None, typer.Option(metavar="N", help="Hexahedra over the quarter turn; by default 10, or by the size.")
+    ] = None,
+    order: Annotated[
+        int | None, typer.Option(metavar="1|2", help="Order of the hexahedra's shape; by default the case's.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE.msh", help="By default CASE.msh.")] = None,
 ) -> None:
-    """Mesh a case with gmsh."""
-    with _as_options({"size"}):
+    """Mesh a case: triangles by gmsh, hexahedra without."""
+    with _as_options({"dim", "size", "sectors", "order"}):
         from extrusion.result import changed
 
-        scene = changed(_load(case), size=size)
+        scene = _load(case)
+        dim = (3 if scene.space == "3d" else 2) if dim is None else dim
+        if dim not in (2, 3):
+            raise InputError("dim", dim, "choose one of 2, 3")
+        if dim == 3 and scene.space == "plane strain":
+            raise InputError("dim", dim, "the case is a slab in plane strain: leave it out")
+        for name, value in (("sectors", sectors), ("order", order)):
+            if dim == 2 and value is not None:
+                raise InputError(name, value, "leave it out, or give --dim 3 too: it is of hexahedra")
+        scene = changed(scene, space="3d" if dim == 3 else None, size=size, sectors=sectors)
     from extrusion.check import require_dolfinx
 
     require_dolfinx()
     from extrusion.mesh import graded_mesh, sheet_mesh, write_mesh
+    from extrusion.mesh3d import hex_mesh, write_hex
 
     path = Path(f"{_default_folder(scene).name}.msh") if out is None else out
-    if _rank() == 0:
-        made = sheet_mesh(scene.profile) if scene.size is None else graded_mesh(scene.profile, scene.size)
-        write_mesh(path, made)
-        print(f"{path}: {len(made.points)} nodes, {sum(map(len, made.cells.values()))} triangles")
+    if _rank() != 0:
+        return
+    if dim == 3:
+        with _as_options({"size", "sectors", "order"}):
+            solid = hex_mesh(scene.profile, scene.mesh_size, scene.sectors, scene.order if order is None else order)
+        write_hex(path, solid)
+        print(f"{path}: {len(solid.points)} nodes, {sum(map(len, solid.cells.values()))} hexahedra")
+        return
+    made = sheet_mesh(scene.profile) if scene.size is None else graded_mesh(scene.profile, scene.size)
+    write_mesh(path, made)
+    print(f"{path}: {len(made.points)} nodes, {sum(map(len, made.cells.values()))} triangles")
 
 
 def main(args: Sequence[str] | None = None) -> NoReturn:

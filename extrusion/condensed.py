@@ -36,7 +36,7 @@ from extrusion.system import System, in_words, node_positions
 
 log = logging.getLogger(__name__)
 
-SOLVERS = ("auto", "surface", "full")
+SOLVERS = ("auto", "surface", "full", "iterative")
 
 BLOCK = 128
 """Right-hand sides that are solved for together."""
@@ -57,6 +57,9 @@ def choose(problem: Problem, solver: str = "auto") -> System:
     if solver not in SOLVERS:
         raise InputError("solver", solver, f"choose one of {', '.join(SOLVERS)}")
     if solver == "full":
+        return problem
+    if solver == "iterative":
+        problem.iterate()
         return problem
     condensed = Condensed(problem)
     cost, memory = condensed.cost, condensed.memory
@@ -359,8 +362,7 @@ class Condensed(System):
         D, f = None, np.zeros(0)
         if self.on_root:
             z, f = self._z(x), self._split(x)[1]
-            parts = [term.tangent(z, geometric) for term in self.terms]
-            rows, cols, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+            rows, cols, values = self.contact_tangent(z, geometric)
             rows, cols = self._force_of_z[rows], self._row_of_z[cols]
             keep = (rows >= 0) & (cols >= 0) & (values != 0.0)
             D = _Derivative(rows[keep], cols[keep], values[keep])
@@ -405,7 +407,8 @@ class Condensed(System):
         free = self.full.z_free.copy()
         free[self.n_z - self.n_multipliers :] = False
         at_rear = R[self._z_y[0] & free].sum()  # K u there
-        return 0.5 * self.full.copies * float(self._time(x) * at_rear - z[free] @ R[free])
+        at_planes = self._placed * (self._z_start[free] @ R[free])
+        return 0.5 * self.full.copies * float(self._time(x) * at_rear + at_planes - z[free] @ R[free])
 
     def named_points(self) -> dict[str, tuple[int, int]]:
         return self._watch
@@ -532,7 +535,7 @@ class _Tangent:
     That is GCR, which wants the image of each correction f: with C h and C E w at hand, one more product with D.
 
     Where there are many forces all of this is in single precision, of which Newton's method, whose residual is not,
-    takes no harm: it gains six digits an iteration.
+    takes no harm: it gains six digits an iteration. Passes of nodal contact would: their end hangs on all digits.
     """
 
     PARALLEL = 0.1
@@ -546,7 +549,7 @@ class _Tangent:
 
     def __init__(self, system: Condensed) -> None:
         self._system = weakref.proxy(system)  # PETSc holds this object in C
-        self._dtype: Any = np.float32 if system.n_forces > self.MANY else np.float64
+        self._dtype: Any = np.float32 if system.n_forces > self.MANY and system.case.method != "nodal" else np.float64
         self._rtol = 1e-6 if self._dtype == np.float32 else 1e-11
         self._getrs = scipy.linalg.get_lapack_funcs("getrs", dtype=self._dtype)
         # of each body, for which forces and rows C is held, and C there

@@ -66,25 +66,11 @@ def sigma(eps: Any, lmbda: Any, mu: Any) -> Any:
     return lmbda * ufl.tr(eps) * ufl.Identity(3) + 2 * mu * eps
 
 
-def virtual_work(
-    u: Any, v: Any, lmbda: Any, mu: Any, dx: Any, axisymmetric: bool = False, dx_volume: Any = None
-) -> Any:
-    """Bilinear form ``int sigma(u) : eps(v)``, N mm; over the whole revolution in axisymmetry.
-
-    With ``dx_volume``, a measure of lower degree, the term in lambda is taken with that (selective reduced
-    integration): trilinear hexahedra then do not lock as the material becomes incompressible. Malkus, Hughes, CMAME
-    15 (1978) 63, doi:10.1016/0045-7825(78)90005-1.
-    """
+def virtual_work(u: Any, v: Any, lmbda: Any, mu: Any, dx: Any, axisymmetric: bool = False) -> Any:
+    """Bilinear form ``int sigma(u) : eps(v)``, N mm; over the whole revolution in axisymmetry."""
     x = ufl.SpatialCoordinate(ufl.domain.extract_unique_domain(u))
-    strain_u, strain_v, weight = (
-        epsilon(u, x, axisymmetric),
-        epsilon(v, x, axisymmetric),
-        measure_weight(x, axisymmetric),
-    )
-    if dx_volume is None:
-        return ufl.inner(sigma(strain_u, lmbda, mu), strain_v) * weight * dx
-    volume = lmbda * ufl.tr(strain_u) * ufl.tr(strain_v) * weight
-    return 2 * mu * ufl.inner(strain_u, strain_v) * weight * dx + volume * dx_volume
+    stress = sigma(epsilon(u, x, axisymmetric), lmbda, mu)
+    return ufl.inner(stress, epsilon(v, x, axisymmetric)) * measure_weight(x, axisymmetric) * dx
 
 
 def mixed_virtual_work(

@@ -11,7 +11,8 @@ runs that are cheaper than the one in question:
 - *die*: the displacements of an elastic die under the forces of the rigid one, by a back-substitution, and what they do
   to K and the reaction, by a solve with the tangent (`Condensed.die_effect`): first order. At 4 mm it finds 0.93 to
   1.23 of the effect on K up to t = 140, and 0.4 of it at t = 155, where K has met the tip of the cone;
-- *zone*: a zone whose gap stays wide open is left out, which changes nothing.
+- *zone*: a zone whose gap stays wide open is left out, which changes nothing;
+- *space*: a scene in three dimensions is solved as axisymmetric, which it is.
 
 Errors are the largest over all steps: relative of K; of the reaction relative to its size, or to its largest before the
 billet's front is in contact where that is more.
@@ -131,11 +132,19 @@ def reaction_scale(steps: Sequence[Step]) -> float:
 
 
 def continuous(case: Case, **changes: Any) -> Case:
-    """The scene of a case as a continuous problem: Nitsche's method along rays, the billet slave."""
+    """The scene of a case as a continuous problem: Nitsche's method along rays, the billet slave, no third dimension.
+
+    Raises:
+        InputError: The scene is not axisymmetric.
+    """
+    if case.off_symmetry:
+        remedy = "no model is chosen for a scene that is not axisymmetric: leave it or the tolerance out"
+        raise InputError("off_symmetry", case.off_symmetry, remedy)
     zones = tuple(dataclasses.replace(zone, slave="billet", gap=None, smooth=False) for zone in case.zones)
     plain: dict[str, Any] = dict(
-        zones=zones, method="nitsche", order=2, form=None, gamma=None, theta=0, mesh=None, size=None
-    )
+        zones=zones, method="nitsche", order=2, form=None, gamma=None, theta=0, mesh=None, size=None, sectors=None,
+        element="lagrange", space="axisymmetric" if case.space == "3d" else case.space,
+    )  # fmt: skip
     return dataclasses.replace(case, **{**plain, **changes})
 
 
@@ -176,6 +185,7 @@ def choose_model(case: Case, tolerance: float, goal: Goal, comm: MPI.Intracomm) 
         raise InputError("tolerance", tolerance, "give a relative error between 0 and 1")
     sizes = [float(f"{part * case.profile.radius:.6g}") for part in LADDER]
     scene = continuous(case)
+    tell_space(case, comm)
     scene, zone_parts = _without_open_zones(scene, sizes[0], comm)
     _tell(comm, "%g mm, rigid die, and what an elastic one would change", sizes[0])
     elastic = case.die == "elastic"
@@ -194,7 +204,7 @@ def choose_model(case: Case, tolerance: float, goal: Goal, comm: MPI.Intracomm) 
     rigid = dataclasses.replace(scene, die="rigid")
     with _unwarned():
         linear = Track.of(solve(dataclasses.replace(rigid, order=1, size=sizes[1]), comm)[0])
-    by_symmetry = (Part("axisymmetry instead of three dimensions", True, NONE),) if case.axisymmetric else ()
+    by_symmetry = (Part("axisymmetry instead of three dimensions", True, NONE),) if scene.axisymmetric else ()
 
     for level in range(1, len(sizes)):
         tracks.append(Track.of(solve(dataclasses.replace(rigid, size=sizes[level]), comm)[0]))
@@ -229,6 +239,12 @@ def choose_model(case: Case, tolerance: float, goal: Goal, comm: MPI.Intracomm) 
             raise InputError("tolerance", tolerance, remedy)
         _tell(comm, "%g mm: estimated error of %s %.1e; the next mesh", sizes[level], goal, by_size[-1].of(goal))
     raise InputError("tolerance", tolerance, f"{sizes[-1]:g} mm, the finest mesh that is tried, does not reach it")
+
+
+def tell_space(case: Case, comm: MPI.Intracomm) -> None:
+    """Say so where `continuous` leaves a dimension out."""
+    if case.space == "3d":
+        _tell(comm, "the three dimensions of case %s have an axis of symmetry: solved as axisymmetric", case.name)
 
 
 def _tell(comm: MPI.Intracomm, message: str, *values: object) -> None:
@@ -293,7 +309,7 @@ TOLERANCES: tuple[tuple[float, Goal], ...] = ((2e-3, "K"), (1e-3, "K"), (2e-4, "
 
 
 def checks(comm: MPI.Intracomm) -> Iterator[Check]:
-    """Estimated and actual errors of the sheet's cases as they stand, and of models chosen for a tolerance. Collective.
+    """Estimated and actual errors of the sheet's cases in the plane, and of models chosen for a tolerance. Collective.
 
     The error of a case on the sheet's own mesh is estimated as its distance to the default method at 4 mm.
     """
@@ -303,6 +319,8 @@ def checks(comm: MPI.Intracomm) -> Iterator[Check]:
     scenes = reference.problems()
     better: dict[str, Track] = {}
     for name, case in cases.CASES.items():
+        if case.space == "3d":
+            continue
         problem = _problem_of(case)
         # uniform increments, so that the run passes the reference's t
         case = case.with_increment(5.0, case.end)

@@ -90,6 +90,21 @@ class Facets:
         across = np.linalg.norm(corners[:, [2, 3]] - corners[:, [0, 1]], axis=2).mean(axis=1)
         return np.asarray(np.minimum(along, across))
 
+    @cached_property
+    def mean_gradients(self) -> Array | None:
+        """Mean over each cell of its shape functions' gradients, ``shape=(m, K, 3)``; None but for trilinear cells.
+
+        Their change of volume is taken as constant in the cell (`Problem`).
+        """
+        if self.cell_nodes.shape[1] != 8:
+            return None
+        s, omega = gauss(2)
+        at = np.stack(np.meshgrid(s, s, s, indexing="ij"), axis=-1).reshape(-1, 3)
+        J = np.einsum("jqk,mki->mqij", self.tabulate_geometry(1, at)[1:], self.cell_X)
+        w = np.abs(np.linalg.det(J)) * np.einsum("a,b,c->abc", omega, omega, omega).ravel()
+        grad = np.einsum("iqk,mqij->mqkj", self.tabulate(1, at)[1:], np.linalg.inv(J))
+        return np.asarray(np.einsum("mq,mqkj->mkj", w, grad) / w.sum(axis=1)[:, None, None])
+
     @property
     def _vertices(self) -> list[int]:
         return {4: [0, 1, 2, 3], 8: [0, 2, 5, 7], 9: [0, 2, 6, 8]}[self.nodes.shape[1]]
@@ -611,7 +626,7 @@ def meet(
     return number, met, past
 
 
-HELD = 0.25
+HELD = 0.02
 """How far past its facet, relative to it, a ray may meet the die and stay with that facet (the facet goes on)."""
 
 
@@ -633,12 +648,14 @@ def _seek(die: Facets, z: Array, x: Array, N: Array, keep: Index | None = None) 
     half = np.full((n * c, 1), 0.5)
     flat = candidates.ravel()
     k, l = _flat_places(xd[flat], many[0][:, 0], half, half, die.nodes.shape[1])  # noqa: E741
-    outside = np.maximum(np.abs(k - 0.5), np.abs(l - 0.5)).reshape(n, c)
-    best = np.argmin(np.where(np.isfinite(outside), outside, np.inf), axis=1)
+    outside = (np.maximum(np.abs(k - 0.5), 0.5) + np.maximum(np.abs(l - 0.5), 0.5) - 1.0).reshape(n, c)
+    outside = np.where(np.isfinite(outside), outside, np.inf)
+    near = outside <= outside.min(axis=1, keepdims=True) + 1e-7  # on an edge: the later facet, whatever the rounding
+    best = np.argmax(np.where(near, candidates, -1), axis=1)
     row = np.arange(n)
     facet = candidates[row, best]
     k, l = (v.reshape(n, c)[row, best][:, None] for v in (k, l))  # noqa: E741
-    past = ~(outside[row, best] <= 0.5 + 1e-9)
+    past = ~(outside[row, best] <= 1e-9)
     k, l = (np.where(np.isnan(v), 0.5, v) for v in (k, l))  # noqa: E741
     if keep is not None:
         half = np.full((n, 1), 0.5)
@@ -714,8 +731,8 @@ def closest(die: Facets | Revolved, z: Array, x: Array, smooth: bool = False, ke
         reach = np.where(candidates == keep[:, None], distance, np.inf).min(axis=1)
         facet = np.where(reach <= distance.min(axis=1) + KEPT * scale, keep, facet)
     row = np.arange(n)
-    at = np.argmax(candidates == facet[:, None], axis=1)
-    k, l = (v.reshape(n, c)[row, at] for v in (k, l))  # noqa: E741
+    which = np.argmax(candidates == facet[:, None], axis=1)
+    k, l = (v.reshape(n, c)[row, which] for v in (k, l))  # noqa: E741
     M = shape2(kd, k, l)
     mine = xd[facet]
     normals = die.side[facet][:, None] * np.cross(
@@ -814,7 +831,8 @@ def stress_rows(slave: Facets, facet: Index, xi: Array, t: Array, direction: Arr
     along_n = np.einsum("nqkj,nqj->nqk", grad, normal)[..., None]
     S = mu * (along_d * normal[:, :, None] + along_n * direction[:, :, None])
     if not mixed:
-        S = S + lmbda * along_N[..., None] * grad
+        mean = slave.mean_gradients
+        S = S + lmbda * along_N[..., None] * (grad if mean is None else mean[facet][:, None])
     S = S.reshape(*shape_, -1)
     if not mixed:
         return np.asarray(S)

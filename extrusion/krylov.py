@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 Triplets = tuple[Index, Index, Array]
 
-RTOL = 1e-7
+RTOL = 1e-8
 """Relative tolerance of a linear solve."""
 
-ROUGH_RTOL = 1e-4
+ROUGH_RTOL = 1e-6
 """The same where the pairing will change anyway."""
 
 

@@ -61,6 +61,9 @@ ALIASES = {
 }
 """Names of the published MED meshes, lower case."""
 
+SOLID = ("hexahedron", "wedge", "tetra", "pyramid")
+"""How meshio's names of cells in three dimensions begin."""
+
 BUNDLED_SIZES = (8.0, 4.0, 2.0, 1.0)
 """Sizes h (mm) of the graded meshes of SSNV504 that are shipped."""
 
@@ -437,6 +440,8 @@ def read_mesh(path: str | Path, needed: Sequence[str] = ()) -> PlainMesh:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise refuse(f"cannot be read as a mesh ({reason}); write it again") from None
 
+    if any(block.type.startswith(SOLID) for block in raw.cells):
+        raise refuse("is a mesh in three dimensions: give one of triangles in (r, y), or space = '3d'")
     points = np.asarray(raw.points, dtype=float)
     found: dict[str, list[Indices]] = {}
     for name, kind, cells in named:

@@ -27,7 +27,7 @@ from dolfinx.graph import adjacencylist
 from dolfinx.io.utils import distribute_entity_data
 
 from extrusion.errors import InputError
-from extrusion.mesh import ALIASES, TAGS, Indices, TaggedMesh, _named_cells, on_root
+from extrusion.mesh import ALIASES, SOLID, TAGS, Indices, TaggedMesh, _named_cells, on_root
 from extrusion.profile import Array, Edge, Profile
 
 FACETS_3D = {
@@ -529,6 +529,8 @@ def read_hex(path: str | Path, needed: Sequence[str] = (), on_circle: bool = Fal
         reason = " ".join(str(error).split()) or type(error).__name__
         raise refuse(f"cannot be read as a mesh ({reason}); write it again") from None
 
+    if not any(block.type.startswith(SOLID) for block in raw.cells):
+        raise refuse("has no cells in three dimensions: give hexahedra of a quarter, or space = 'axisymmetric'")
     found: dict[str, dict[int, list[Indices]]] = {}  # group -> number of vertices -> cells
     solids = {kind for _, kind, _ in named if kind.startswith(("hexahedron", "wedge"))}
     order = 2 if solids == {"hexahedron27"} and suffix == ".msh" else 1

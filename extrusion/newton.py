@@ -141,8 +141,8 @@ class Newton:
         self.problem.set_accuracy(self.snes.getKSP(), self.tolerance, at_most is not None)
         predicted = self._predict(x)
         self.snes.solve(None, x)
-        reason = self.snes.getConvergedReason()
         iterations = self.snes.getIterationNumber() + predicted
+        reason = self.snes.getConvergedReason()
         return Outcome(reason > 0, iterations, self.history[-1], REASONS.get(reason, str(reason)))
 
     def _predict(self, x: PETSc.Vec) -> int:

@@ -18,6 +18,7 @@ from mpi4py import MPI
 
 import numpy as np
 
+from dolfinx import fem
 from dolfinx.io import VTXMeshPolicy, VTXWriter
 
 import extrusion
@@ -25,6 +26,7 @@ from extrusion import plots
 from extrusion.cases import Case, to_toml
 from extrusion.errors import InputError
 from extrusion.mesh import on_root
+from extrusion.mesh3d import FACES
 from extrusion.problem import Problem
 from extrusion.result import Array, Observer, Result, Snapshots
 from extrusion.stepping import Step
@@ -154,16 +156,17 @@ class History(_Table):
 class Contact(_Table):
     """``contact.csv``: one line a step and contact point, along the slave surface of each zone.
 
-    mm and MPa; `pressure` is normal to the die, `ray_pressure` its part along the zone's ray, per reference area;
-    `weight` (mm^2) is the area that the point stands for; `closed` is 1 where contact acts (or, if it is only checked,
-    where the bodies interpenetrate).
+    mm and MPa; the point is at `r`, `y`, or in three dimensions at `x`, `y`, `z` in the quarter; `pressure` is normal
+    to the die, `ray_pressure` its part along the zone's ray, per reference area; `weight` (mm^2) is the area that the
+    point stands for; `closed` is 1 where contact acts (or, if it is only checked, where the bodies interpenetrate).
     """
 
     name = "contact.csv"
 
     def __call__(self, problem: Problem, step: Step) -> None:
         """Write a step."""
-        header = ("t", "zone", "s", "r", "y", "gap", "pressure", "ray_pressure", "weight", "closed")
+        place = ("x", "y", "z") if problem.dim == 3 else ("r", "y")
+        header = ("t", "zone", "s", *place, "gap", "pressure", "ray_pressure", "weight", "closed")
         rows = [
             (step.t, zone, *values)
             for zone, state in step.zones.items()
@@ -187,18 +190,29 @@ class Contact(_Table):
 
 
 class Fields:
-    """``fields.bp`` for ParaView: displacement (mm) and von Mises stress (MPa, cell means) of both bodies."""
+    """``fields.bp`` for ParaView: displacement (mm) and von Mises stress (MPa, cell means) of both bodies.
+
+    ParaView has no 20-node hexahedron of ours: its displacements are written as those of the 27-node one.
+    """
 
     def __init__(self, folder: str | Path) -> None:
         self._path = Path(folder) / "fields.bp"
         self._writer: VTXWriter | None = None
+        self._written: fem.Function | None = None  # takes the place of the displacement
 
     def __call__(self, problem: Problem, step: Step) -> None:
         """Write a step. Collective."""
         fields = problem.stress_fields(step.x)
+        u = fields["displacement"]
         if self._writer is None:
             write_on_root(problem.comm, self._path, lambda: self._path.parent.mkdir(parents=True, exist_ok=True))
+            if problem.case.element == "serendipity":
+                msh, dim = problem.tagged.msh, problem.dim
+                self._written = fem.Function(fem.functionspace(msh, ("Lagrange", 2, (dim,))), name=u.name)
+                fields["displacement"] = self._written
             self._writer = VTXWriter(problem.comm, self._path, [*fields.values()], mesh_policy=VTXMeshPolicy.reuse)
+        if self._written is not None:
+            self._written.interpolate(u)
         self._writer.write(step.t)
 
     def close(self) -> None:
@@ -207,8 +221,55 @@ class Fields:
             self._writer.close()
 
 
+class Faces:
+    """All triangles of the plane, or in space some boundary quadrilaterals, of all ranks on rank 0. Collective.
+
+    Args:
+        problem: The scene.
+        groups: Facet groups to take, in space.
+
+    Attributes:
+        points: Reference positions of the vertices, each once, ``shape=(n, dim)``, mm.
+        corners: Vertices of each face, going round, ``shape=(m, 3)`` or ``(m, 4)``.
+        billet: Whether it is the billet's, not the die's, ``shape=(m,)``.
+    """
+
+    def __init__(self, problem: Problem, groups: Iterable[str] = ()) -> None:
+        V, msh, tagged = problem.V, problem.tagged.msh, problem.tagged
+        owned, dim = msh.topology.index_map(problem.dim).size_local, problem.dim
+        if dim == 2:
+            self._cells = np.arange(owned)
+            corners = V.dofmap.list[:owned, :3]
+        else:
+            for pair in ((2, 3), (3, 2)):
+                msh.topology.create_connectivity(*pair)
+            to_cell, to_facet = (msh.topology.connectivity(*pair) for pair in ((2, 3), (3, 2)))
+            found = [tagged.facet_tags.find(tagged.groups[name]) for name in groups if name in tagged.groups]
+            facets = np.concatenate([*found, np.zeros(0, dtype=np.int32)])
+            cells = to_cell.array[to_cell.offsets[facets]]  # a boundary facet has one
+            facets, self._cells = facets[cells < owned], cells[cells < owned]
+            number = np.argmax(to_facet.array.reshape(-1, 6)[self._cells] == facets[:, None], axis=1)
+            corners = np.take_along_axis(V.dofmap.list[self._cells], FACES[number], axis=1)
+        self._vertices, local = np.unique(corners, return_inverse=True)
+        number = V.dofmap.index_map.local_to_global(self._vertices.astype(np.int32))
+        billet = np.isin(self._cells, tagged.cell_tags.find(tagged.groups["billet"]))
+        points = V.tabulate_dof_coordinates()[self._vertices, :dim]
+        parts = problem.comm.gather((number, points, number[local.reshape(corners.shape)], billet))
+        if parts is not None:
+            numbers, X, faces, self.billet = (np.concatenate(part) for part in zip(*parts, strict=True))
+            numbers, self._first = np.unique(numbers, return_index=True)
+            self.points, self.corners = X[self._first], np.searchsorted(numbers, faces)
+
+    def fields(self, problem: Problem, step: Step) -> tuple[Array, Array] | None:
+        """Displacements of the vertices (mm) and von Mises stress of the cells behind the faces (MPa), on rank 0."""
+        fields = problem.stress_fields(step.x)
+        u = problem.comm.gather(fields["displacement"].x.array.reshape(-1, problem.dim)[self._vertices])
+        mises = problem.comm.gather(fields["von_mises"].x.array[self._cells])
+        return None if u is None else (np.concatenate(u)[self._first], np.concatenate(mises))
+
+
 class Camera:
-    """Takes the steps nearest to some t, and the last one, as `Snapshots` on rank 0.
+    """Takes the steps nearest to some t, and the last one, as `Snapshots` on rank 0: in space those of the plane z = 0.
 
     Args:
         case: Its increments say which steps are nearest.
@@ -220,7 +281,7 @@ class Camera:
         self._wanted = {min(times, key=lambda t: abs(t - target)) for target in wanted}
         self._taken: dict[float, tuple[Array, Array]] = {}
         self._last: tuple[Problem, Step] | None = None  # not taken yet
-        self._vertices: np.ndarray | None = None  # this rank's vertex dofs
+        self._faces: Faces | None = None
 
     def __call__(self, problem: Problem, step: Step) -> None:
         """Take a step if it is wanted. Collective."""
@@ -235,35 +296,25 @@ class Camera:
 
     def _take(self, problem: Problem, step: Step) -> None:
         self._last = None
-        if self._vertices is None:
-            self._survey(problem)
-        fields = problem.stress_fields(step.x)
-        u = problem.comm.gather(fields["displacement"].x.array.reshape(-1, 2)[self._vertices])
-        mises = problem.comm.gather(fields["von_mises"].x.array[: self._cells])
-        if u is not None:
-            self._taken[step.t] = np.concatenate(u)[self._first], np.concatenate(mises)
-
-    def _survey(self, problem: Problem) -> None:
-        """Vertices and triangles of all ranks, each vertex once."""
-        V, msh, comm = problem.V, problem.tagged.msh, problem.comm
-        self._cells = msh.topology.index_map(2).size_local
-        corners = V.dofmap.list[: self._cells, :3]
-        self._vertices, local = np.unique(corners, return_inverse=True)
-        number = V.dofmap.index_map.local_to_global(self._vertices.astype(np.int32))
-        billet = np.zeros(self._cells, dtype=bool)
-        cells = problem.tagged.cell_tags.find(problem.tagged.groups["billet"])
-        billet[cells[cells < self._cells]] = True
-        points = V.tabulate_dof_coordinates()[self._vertices, :2]
-        parts = comm.gather((number, points, number[local.reshape(-1, 3)], billet))
-        if parts is None:
-            return
-        numbers, X, triangles, is_billet = (np.concatenate(part) for part in zip(*parts, strict=True))
-        numbers, self._first = np.unique(numbers, return_index=True)
-        self._scene = X[self._first], np.searchsorted(numbers, triangles), is_billet
+        if self._faces is None:
+            self._faces = Faces(problem, ("billet_z", "die_z"))
+        found = self._faces.fields(problem, step)
+        if found is not None:
+            self._taken[step.t] = found
 
     def snapshots(self) -> Snapshots | None:
-        """What has been taken."""
-        if not self._taken:
+        """What has been taken; a quadrilateral as two triangles."""
+        faces = self._faces
+        if not self._taken or faces is None:
             return None
         u, mises = (np.stack(values) for values in zip(*self._taken.values(), strict=True))
-        return Snapshots(*self._scene, np.array(list(self._taken)), u, mises)
+        halves = [[0, i, i + 1] for i in range(1, faces.corners.shape[1] - 1)]
+        triangles, n = faces.corners[:, halves].reshape(-1, 3), len(halves)
+        return Snapshots(
+            points=faces.points[:, :2],
+            triangles=triangles,
+            billet=np.repeat(faces.billet, n),
+            t=np.array(list(self._taken)),
+            displacement=u[..., :2],
+            von_mises=np.repeat(mises, n, axis=1),
+        )

@@ -79,6 +79,7 @@ class Pair(ABC):
     extended: bool  # the master's end lines go on past its ends; else a point there is let go
 
     dim = 2
+    copies = 1  # of what is solved in the whole revolution
 
     # -- nodes -----------------------------------------------------------------------------------------------
 

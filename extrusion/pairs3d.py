@@ -38,6 +38,7 @@ class SurfacePair(Pair):
     die: Facets | Revolved
 
     dim = 3
+    copies = COPIES
 
     # -- nodes -----------------------------------------------------------------------------------------------
 
@@ -167,7 +168,7 @@ class SurfacePair(Pair):
         X = (N @ slave.X[points.facet]).reshape(-1, 3)
         cos = points.cosine
         ray, normal = (-stress, -stress / cos) if self.ray else (-stress * cos, -stress)
-        weight = COPIES * points.weight
+        weight = self.copies * points.weight
         return ContactState(
             x, self.arc(X), points.gap.ravel(), normal.ravel(), ray.ravel(), weight.ravel(), closed.ravel()
         )

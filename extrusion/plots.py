@@ -15,13 +15,16 @@ import numpy as np
 
 from extrusion.cases import Case, from_dict
 from extrusion.errors import InputError
-from extrusion.result import PICTURED, Array, Result, Snapshots
+from extrusion.result import PICTURED, Array, Result, Snapshots, element_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Kind = Literal["billet", "history", "pressure"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
+
+RING = 0.004
+"""Width along the axis of a ring of contact points in three dimensions, by the billet's radius."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +218,10 @@ def history(record: Record) -> Figure:
 
 
 def pressure(record: Record) -> Figure:
-    """Contact pressure along the billet's side, normal to the die, at the pictured t; the die's vertices as lines."""
+    """Contact pressure along the billet's side, normal to the die, at the pictured t; the die's vertices as lines.
+
+    In three dimensions the mean round the axis, with a band from the least to the most.
+    """
     profile = record.case.profile
     figure = _figure(record, 8, 4.2)
     ax = figure.subplots()
@@ -224,6 +230,9 @@ def pressure(record: Record) -> Figure:
     )
     for i, t in enumerate(times):
         y, p = record.pressure[t]
+        if record.case.space == "3d":
+            y, p, least, most = rings(y, p, RING * profile.radius)
+            ax.fill_between(y, least, most, color=f"C{i}", alpha=0.25, linewidth=0)
         ax.plot(y, p, ".-", color=f"C{i}", markersize=4, linewidth=1, label=f"t = {t:g} mm")
     for name in profile.bore:
         y_vertex = profile.points[name][1]
@@ -244,13 +253,33 @@ def pressure(record: Record) -> Figure:
     return figure
 
 
+def rings(y: Array, p: Array, width: float) -> tuple[Array, Array, Array, Array]:
+    """Points at about the same y put together: y, and the mean, the least and the most of p, by growing y.
+
+    Args:
+        y: Positions along the axis, mm.
+        p: A value at each.
+        width: Of a ring along y, at most, mm.
+    """
+    order = np.argsort(y, kind="stable")
+    y, p = y[order], p[order]
+    starts, edge = [], -np.inf
+    for i, here in enumerate(y):
+        if here > edge:
+            starts.append(i)
+            edge = here + width
+    count = np.diff([*starts, len(y)])
+    mean = [np.add.reduceat(values, starts) / count for values in (y, p)]
+    return mean[0], mean[1], np.minimum.reduceat(p, starts), np.maximum.reduceat(p, starts)
+
+
 def _figure(record: Record, width: float, height: float) -> Figure:
     """An empty figure (inches) outside pyplot, with the run as its title; a notebook shows it."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
     case = record.case
-    figure.suptitle(f"Case {case.name}: {case.method}, P{case.order}, {case.die} die", fontsize="medium")
+    figure.suptitle(f"Case {case.name}: {case.method}, {element_name(case)}, {case.die} die", fontsize="medium")
 
     def png() -> bytes:
         figure.savefig(buffer := io.BytesIO(), format="png")

@@ -73,7 +73,8 @@ class Problem(System):
 
     def __init__(self, case: Case, mesh: PlainMesh | HexMesh | None, comm: MPI.Intracomm = MPI.COMM_WORLD) -> None:
         self.case, self.comm = case, comm
-        if case.order == 1 and case.billet.nu >= LOCKING_FROM and case.method != "nodal" and comm.rank == 0:
+        locks = case.order == 1 and case.billet.nu >= LOCKING_FROM and case.space != "3d"
+        if locks and case.method != "nodal" and comm.rank == 0:
             log.warning(
                 "order = 1 at nu = %g: linear triangles lock: pressure and reaction are far off, use order 2",
                 case.billet.nu,
@@ -105,27 +106,46 @@ class Problem(System):
         msh, groups = self.tagged.msh, self.tagged.groups
         degree = quadrature_degree(self.case.order, self.case.axisymmetric, self.dim)
         dx = ufl.Measure("dx", msh, subdomain_data=self.tagged.cell_tags, metadata={"quadrature_degree": degree})
-        low = self.dim == 3 and self.case.order == 1  # trilinear: volume changes at the middle of the cell only
-        middle = dx(metadata={"quadrature_degree": 0}) if low else None
+        trilinear = self.dim == 3 and self.case.order == 1
         u, v = ufl.TrialFunction(self.V), ufl.TestFunction(self.V)
         form: ufl.Form = 0
         blocks: list[list[ufl.Form]] = []
         for body in self.bodies:
             material = self._materials[body]
-            lmbda, mu = (fem.Constant(msh, float(value)) for value in (material.lmbda, material.mu))
+            lmbda = fem.Constant(msh, 0.0 if trilinear else material.lmbda)
+            mu = fem.Constant(msh, material.mu)
             measure = dx(groups[body])
             if body == "billet" and self.Q is not None:
                 p, q = ufl.TrialFunction(self.Q), ufl.TestFunction(self.Q)
                 blocks = mixed_virtual_work(u, p, v, q, lmbda, mu, measure, axisymmetric=self.case.axisymmetric)
                 form += blocks[0][0]
             else:
-                at_middle = middle(groups[body]) if middle is not None else None
-                form += virtual_work(u, v, lmbda, mu, measure, self.case.axisymmetric, at_middle)
+                form += virtual_work(u, v, lmbda, mu, measure, axisymmetric=self.case.axisymmetric)
         if blocks:
             blocks[0][0] = form
         self._bulk_form = fem.form(blocks or form)
         self.K = dolfinx.fem.petsc.assemble_matrix(self._bulk_form, kind="mpi" if blocks else None)
         self.K.assemble()
+        if trilinear:
+            self._add_mean_volume(dx)
+
+    def _add_mean_volume(self, dx: ufl.Measure) -> None:
+        """The term in lambda, with the mean of each cell's change of volume: trilinear hexahedra do not lock so.
+
+        ``D^T (lambda / V) D`` with ``D u = int div u`` over each cell. Nagtegaal, Parks, Rice, CMAME 4 (1974) 153,
+        doi:10.1016/0045-7825(74)90032-2; Hughes, IJNME 15 (1980) 1413, doi:10.1002/nme.1620150914.
+        """
+        msh, groups = self.tagged.msh, self.tagged.groups
+        DG0 = fem.functionspace(msh, ("DG", 0))
+        q, lmbda = ufl.TestFunction(DG0), np.zeros(DG0.dofmap.index_map.size_local + DG0.dofmap.index_map.num_ghosts)
+        for body in self.bodies:
+            lmbda[self.tagged.cell_tags.find(groups[body])] = self._materials[body].lmbda
+        D = dolfinx.fem.petsc.assemble_matrix(fem.form(q * ufl.div(ufl.TrialFunction(self.V)) * dx))
+        D.assemble()
+        V = dolfinx.fem.petsc.assemble_vector(fem.form(q * dx))
+        V.array[:] = np.sqrt(lmbda[: V.local_size] / V.array_r)
+        D.diagonalScale(V, None)
+        self.K.axpy(1.0, D.transposeMatMult(D))
 
     def stress_fields(self, x: PETSc.Vec) -> dict[str, fem.Function]:
         """Displacement (mm) and von Mises stress (MPa, one a cell) at x: the same two functions at each call."""
@@ -411,8 +431,7 @@ class Problem(System):
     def tangent(self, x: PETSc.Vec, geometric: bool) -> PETSc.Mat:
         """Derivative of the residual; a new matrix whenever its pattern has grown."""
         z = self.gather(x)
-        parts = [term.tangent(z, geometric) for term in self.terms]
-        rows, cols, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+        rows, cols, values = self.contact_tangent(z, geometric)
         if self._krylov is not None:
             stiff = [term.stiff(z) for term in self.terms]
             triplets = (np.concatenate(part) for part in zip(*(part for part, _ in stiff), strict=True))
@@ -443,6 +462,9 @@ class Problem(System):
         """From now on solve the tangent's linear systems by a Krylov method instead of factoring them."""
         from extrusion.krylov import Krylov
 
+        if self.dim == 2 or self.case.mixed:
+            why = "is for three dimensions" if self.dim == 2 else "is for the displacement form"
+            raise InputError("solver", "iterative", f"{why}: choose surface, full or auto")
         self._krylov = Krylov(self)
 
     def agreed(self, yes: bool) -> bool:

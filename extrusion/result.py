@@ -43,9 +43,13 @@ PICTURED = (20.0, 70.0, 155.0)
 """The t (mm) of the sheet's pictures."""
 
 
+CHOSEN = ("method", "order", "size", "mesh", "sectors", "element", "form", "gamma", "theta")
+"""What a tolerance chooses, and so is not given beside one."""
+
+
 @dataclass(frozen=True)
 class Snapshots:
-    """The scene at a few t, for pictures. Straight-sided triangles, also where displacements are quadratic."""
+    """The meridian plane at a few t, for pictures. Straight-sided triangles, also where displacements are quadratic."""
 
     points: Array  # (n, 2) reference positions (r, y), mm
     triangles: NDArray[np.int64]  # (m, 3)
@@ -85,7 +89,7 @@ class Result:
     converged: bool
     error: str | None  # why the run stopped early
     solver: str  # surface or full
-    seconds: dict[str, float]  # setup, solve, output; of solve on the surface: factor, condensation
+    seconds: dict[str, float]  # setup, solve, output; of solve: on the surface factor and condensation, and pairing
     snapshots: Snapshots | None = field(repr=False, compare=False)  # rank 0; None without accepted steps
     estimate: Estimate | None = None  # how far off it is, if the model was chosen for a tolerance
 
@@ -194,7 +198,7 @@ class Result:
 
     def _title(self) -> str:
         case, ranks = self.case, "1 rank" if self.ranks == 1 else f"{self.ranks} ranks"
-        return f"{case.name}: {case.method}, P{case.order}, {case.die} die, {self.dofs} dofs, {ranks}"
+        return f"{case.name}: {case.method}, {element_name(case)}, {case.die} die, {self.dofs} dofs, {ranks}"
 
     def _caption(self) -> str:
         end = "converged" if self.converged else f"stopped: {self.error}"
@@ -231,6 +235,13 @@ class Result:
         return header, rows
 
 
+def element_name(case: Case) -> str:
+    """In short: P1 or P2 (triangles), Q1 or Q2 (hexahedra), or 20-node (serendipity hexahedra)."""
+    if case.element == "serendipity":
+        return "20-node"
+    return f"{'Q' if case.space == '3d' else 'P'}{case.order}"
+
+
 def _fixed(value: float, digits: int) -> str:
     return f"{round(value, digits) + 0.0:.{digits}f}"  # no -0.000
 
@@ -245,14 +256,16 @@ def changed(case: Case, **changes: Any) -> Case:
     Args:
         case: What to start from.
         **changes: Fields of `Case`, and ``contact``, ``increment``, ``until`` as in its ``with_contact`` and
-            ``with_increment``. A size takes the place of the case's mesh file, and a mesh file of its size.
+            ``with_increment``. A size or sectors take the place of the case's mesh file, and a mesh file theirs;
+            another space that of mesh file, sectors and element.
 
     Raises:
-        InputError: A value is out of range, or both a size and a mesh file are given.
+        InputError: A value is out of range, or a mesh file is given beside a size or sectors.
     """
     changes = {name: value for name, value in changes.items() if value is not None}
-    if "size" in changes and "mesh" in changes:
-        raise InputError("size", changes["size"], "a mesh file has its own element size: give one or the other")
+    made = [name for name in ("size", "sectors") if name in changes]
+    if made and "mesh" in changes:
+        raise InputError(made[0], changes[made[0]], "a mesh file has its own elements: give one or the other")
     contact, increment, until = (changes.pop(name, None) for name in ("contact", "increment", "until"))
     if contact is not None:
         if contact not in CLOSURES:
@@ -260,8 +273,12 @@ def changed(case: Case, **changes: Any) -> Case:
         case = case.with_contact(contact)
     if increment is not None or until is not None:
         case = case.with_increment(increment, until)
-    if "size" in changes or "mesh" in changes:
-        changes = {"size": None, "mesh": None, **changes}
+    if "mesh" in changes:
+        changes = {"size": None, "sectors": None, **changes}
+    elif made:
+        changes["mesh"] = None
+    if changes.get("space", case.space) != case.space:
+        changes = {"mesh": None, "sectors": None, "element": "lagrange", **changes}
     return dataclasses.replace(case, **changes) if changes else case
 
 
@@ -322,11 +339,7 @@ def run(
     if adapt and tolerance is None:
         raise InputError("adapt", adapt, "give a tolerance too: the mesh is refined until the goal has it")
     if tolerance is not None:
-        chosen = {
-            "mesh": mesh,
-            **{name: changes.get(name) for name in ("method", "order", "size", "form", "gamma", "theta")},
-        }
-        for name, value in chosen.items():
+        for name, value in {**{name: changes.get(name) for name in CHOSEN}, "mesh": mesh}.items():
             if value is not None:
                 raise InputError(name, value, "leave it out: with a tolerance the model is chosen")
         if adapt:
@@ -364,7 +377,7 @@ def run(
     for observer in watching:
         if close := getattr(observer, "close", None):
             close()
-    seconds |= getattr(system, "seconds", {})
+    seconds |= {**getattr(system, "seconds", {}), "pairing": system.pairing}
     points = sum(len(state.gap) for state in accepted[-1].zones.values()) if accepted else 0
     result = Result(
         case=case,
@@ -379,10 +392,11 @@ def run(
         snapshots=camera.snapshots(),
         estimate=estimate,
     )
-    if folder is not None and adapt and plain is not None:
-        from extrusion.mesh import write_mesh
+    if folder is not None and adapt:
+        from extrusion.mesh import PlainMesh, write_mesh
 
-        write_mesh(folder.path / "mesh.msh", plain)  # to run it again with --mesh
+        if isinstance(plain, PlainMesh):  # on rank 0
+            write_mesh(folder.path / "mesh.msh", plain)  # to run it again with --mesh
     if folder is not None:
         options = {"mesh": given, "solver": solver, "tolerance": tolerance, "adapt": adapt or None}
         folder.finish(result, {**options, **changes})

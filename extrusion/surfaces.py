@@ -162,9 +162,12 @@ def gather_faces(V: Any, facets: Index, base: int, Q: Any = None) -> FaceTrace:
     corner_X = np.einsum("vk,mki->mvi", geometry.tabulate(0, CUBE)[0, ..., 0], cell_X)
     # of the eight ways to lay s and t on the face, the one along which the base and the azimuth grow most
     ways = np.array([[0, 1, 2], [1, 0, 3], [2, 3, 0], [3, 2, 1], [0, 2, 1], [2, 0, 3], [1, 3, 0], [3, 1, 2]])
-    corners = corner_X[np.arange(len(cells))[:, None], faces[number]]  # (m, 4, 3)
+    corners = corner_X[np.arange(len(cells))[:, None], faces[number]] + 0.0  # (m, 4, 3); -0 has another azimuth
     along = corners[..., 1] if base == 1 else np.hypot(corners[..., 0], corners[..., 2])
-    angle = np.arctan2(corners[..., 2], corners[..., 0]) * np.hypot(corners[..., 0], corners[..., 2]).mean()
+    radius = np.hypot(corners[..., 0], corners[..., 2]).mean(
+        axis=1, keepdims=True
+    )  # of the facet: the same on any rank
+    angle = np.arctan2(corners[..., 2], corners[..., 0]) * radius
     scale = np.abs(corners - corners.mean(axis=1, keepdims=True)).max(axis=(1, 2))[:, None]
     gain = (along[:, ways[:, 1]] - along[:, ways[:, 0]] + angle[:, ways[:, 2]] - angle[:, ways[:, 0]]) / scale
     chosen = faces[number][np.arange(len(cells))[:, None], ways[np.argmax(np.round(gain, 6), axis=1)]]

@@ -193,7 +193,8 @@ class NodalContact:
         with np.errstate(divide="ignore", invalid="ignore"):
             stress = np.where(np.abs(self.weight) > 1e-9 * np.max(self.weight), -sc / self.weight, np.nan)
         normal = stress / self._cos if self.pair.ray else stress
-        return ContactState(x, self.pair.arc(self.X), gap, normal, normal * self._cos, self.weight, closed)
+        weight = self.pair.copies * self.weight
+        return ContactState(x, self.pair.arc(self.X), gap, normal, normal * self._cos, weight, closed)
 
 
 class IntegratedContact:

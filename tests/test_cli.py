@@ -14,6 +14,7 @@ import pytest
 import extrusion
 from extrusion import cases, cli
 from extrusion.mesh import read_mesh
+from extrusion.mesh3d import read_hex
 from extrusion.newton import Newton
 
 Capture = pytest.CaptureFixture[str]
@@ -33,6 +34,21 @@ def command(*args: str) -> int:
     return end.value.code
 
 
+def msh(kind: tuple[int, int]) -> str:
+    """A mesh file of one cell, of gmsh's type and number of nodes."""
+    name, (number, nodes) = 2 if kind[0] == 2 else 3, kind
+    corners = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)][:nodes]
+    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", "1", f'{name} 1 "billet"']
+    lines += [
+        "$EndPhysicalNames",
+        "$Nodes",
+        str(nodes),
+        *(f"{i} {x} {y} {z}" for i, (x, y, z) in enumerate(corners, 1)),
+    ]
+    lines += ["$EndNodes", "$Elements", "1", f"1 {number} 2 1 1 " + " ".join(map(str, range(1, nodes + 1)))]
+    return "\n".join([*lines, "$EndElements", ""])
+
+
 BROKEN = {
     "no.toml": "name = ",
     "short.toml": 'name = "short"\n',
@@ -40,7 +56,10 @@ BROKEN = {
     "key.toml": "metod = 1\n" + cases.to_toml(cases.A),
     "place.toml": cases.to_toml(cases.A).replace('name = "A"', 'name = "../place"', 1),
     "mesh.msh": "no mesh",
+    "flat.msh": msh((2, 3)),
+    "solid.msh": msh((5, 8)),
     "mesh.txt": "",
+    "slab.toml": cases.to_toml(replace(cases.A, space="plane strain")),
 }
 
 
@@ -78,6 +97,30 @@ BROKEN = {
         ("verify short.toml", "short.toml: increments"),
         ("verify A Z", "CASE = 'Z'"),
         ("plot .", "no run.json there"),
+        ("run A --mesh solid.msh", "--mesh = 'solid.msh': is a mesh in three dimensions"),
+        ("run B --mesh flat.msh", "--mesh = 'flat.msh': has no cells in three dimensions"),
+        ("run B --mesh solid.msh", "--mesh = 'solid.msh': has no group 'side'"),
+        ("run B --sectors 4 --mesh solid.msh", "--sectors = 4: a mesh file has its own elements"),
+        ("run B --sectors 7", "--sectors = 7: give an even integer"),
+        ("run A --sectors 4", "--sectors = 4: leave it out: it is for space = '3d'"),
+        ("run A --space flat", "--space = 'flat': choose one of"),
+        ("run A --element serendipity", "--element = 'serendipity'"),
+        ("run B --element serendipity", "needs space = '3d' and order 2"),
+        ("run B --element tetra", "--element = 'tetra': choose one of"),
+        ("run J --space axisymmetric", "off_symmetry = 1e-06"),
+        ("run A --solver guess", "--solver = 'guess': choose one of"),
+        ("run B --tolerance 1e-2 --sectors 4", "--sectors = 4: leave it out: with --tolerance"),
+        ("run G --tolerance 1e-2 --element lagrange", "--element = 'lagrange': leave it out: with --tolerance"),
+        ("run J --tolerance 1e-2", "off_symmetry = 1e-06: no model is chosen"),
+        ("run J --tolerance 1e-2 --adapt", "off_symmetry = 1e-06: no model is chosen"),
+        ("mesh A --dim 4", "--dim = 4: choose one of 2, 3"),
+        ("mesh slab.toml --dim 3", "--dim = 3: the case is a slab"),
+        ("mesh A --sectors 4", "--sectors = 4: leave it out, or give --dim 3"),
+        ("mesh B --dim 2 --order 2", "--order = 2: leave it out, or give --dim 3"),
+        ("mesh B --sectors 7", "--sectors = 7: give an even integer"),
+        ("mesh B --order 3", "--order = 3: give 1 or 2"),
+        ("mesh B --size 0.1", "--size = 0.1: give an element size between"),
+        ("mesh B --out b.med", "'b.med': give a name that ends in .msh"),
         ("mesh A --size 0", "--size = 0.0"),
         ("mesh A --out a.med", "'a.med': give a name that ends in .msh"),
         ("weld A", "weld"),
@@ -191,9 +234,52 @@ def test_mesh(here: Path, capsys: Capture) -> None:
     assert command("run", "A", "--mesh", "coarse.msh", "--until", "5", "--quiet") == 0
 
 
+def test_mesh_in_space(here: Path, capsys: Capture) -> None:
+    """Hexahedra by --dim 3, for a case in three dimensions by themselves; `run` takes them, without gmsh."""
+    assert command("mesh", "A", "--dim", "3", "--size", "16", "--sectors", "4", "--order", "2", "--out", "a.msh") == 0
+    assert command("mesh", "B", "--size", "16") == 0
+    told = capsys.readouterr().out.splitlines()
+    for path, line, order in (("a.msh", told[0], 2), ("B.msh", told[1], 1)):
+        made = read_hex(path)
+        assert made.order == order
+        assert line == f"{path}: {len(made.points)} nodes, {sum(map(len, made.cells.values()))} hexahedra"
+    given = ("--space", "3d", "--order", "2", "--mesh", "a.msh", "--until", "5")
+    assert command("run", "A", *given) == 0
+    assert "Q2" in capsys.readouterr().out
+    assert command("run", "B", "--mesh", "B.msh", "--until", "5", "--quiet") == 0
+    dofs = [json.loads((here / f"results/{case}/run.json").read_text())["dofs"] for case in "AB"]
+    assert dofs[0] > 5 * dofs[1]
+
+
+def test_run_in_space(here: Path) -> None:
+    """--space, --sectors and --element make another case, which run.json has; 20 nodes are fewer than 27."""
+    dofs = []
+    for element in ("lagrange", "serendipity"):
+        given = ("--order", "2", "--size", "16", "--sectors", "6", "--element", element)
+        assert command("run", "A", "--space", "3d", *given, "--until", "5", "--out", element, "--quiet") == 0
+        data = json.loads((here / element / "run.json").read_text())
+        assert {'space = "3d"', "sectors = 6", f'element = "{element}"'} <= set(data["toml"].splitlines())
+        dofs.append(data["dofs"])
+    assert 1.4 < dofs[0] / dofs[1] < 2.0
+    assert command("run", "G", "--space", "axisymmetric", "--until", "5", "--quiet") == 0
+
+
+def test_tolerance_in_space(here: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A case with an axis of symmetry is solved as axisymmetric, and that is said."""
+    assert command("run", "B", "--tolerance", "1e-2", "--until", "15", "--json", "b.json") == 0
+    assert "case B have an axis of symmetry: solved as axisymmetric" in caplog.text
+    data = json.loads((here / "b.json").read_text())
+    assert data["estimate"]["parts"][0]["name"] == "axisymmetry instead of three dimensions"
+    assert 'space = "axisymmetric"' in json.loads((here / "results/B/run.json").read_text())["toml"]
+
+
 def test_list_and_version(capsys: Capture) -> None:
     assert command("list") == 0
-    assert cases.A.title[:20] in capsys.readouterr().out
+    listed = capsys.readouterr().out
+    for name, case in cases.CASES.items():
+        (line,) = (line for line in listed.splitlines() if line.split()[:1] == [name])
+        assert line.split()[1] == case.space
+    assert "P1, discrete contact" in listed
     assert command("--version") == 0
     assert capsys.readouterr().out.strip() == extrusion.__version__
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 import jupytext
+import numpy as np
 import pytest
 from nbclient import NotebookClient
 
@@ -48,6 +49,54 @@ def test_two_ranks() -> None:
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("2 ranks") == 1
+
+
+def in_process(code: str, *args: str) -> subprocess.CompletedProcess[str]:
+    """Python of its own, in the project's folder."""
+    return subprocess.run([sys.executable, "-c", code, *args], capture_output=True, text=True, timeout=120, cwd=ROOT)
+
+
+DRAW = """
+import runpy, sys
+from pathlib import Path
+runpy.run_path("demos/billet_in_3d.py")["main"](Path(sys.argv[1]), order=1, size=16, sectors=4, until=20)
+"""
+
+
+def test_billet_in_3d(tmp_path: Path) -> None:
+    """A picture without a display: white around, coloured in it."""
+    pytest.importorskip("pyvista")
+    done = in_process(DRAW, str(tmp_path / "billet.png"))
+    assert done.returncode == 0, done.stderr
+    from matplotlib.image import imread
+
+    drawn = imread(tmp_path / "billet.png")[..., :3]
+    assert (drawn[[0, -1]] == 1).all()
+    assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 1000
+    assert (np.ptp(drawn, axis=2) > 0.5).mean() > 0.02
+
+
+def test_billet_in_3d_without_pyvista(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """One line says what to install."""
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(ROOT / "demos" / "billet_in_3d.py"), run_name="__main__")
+    assert end.value.code == 2
+    assert capsys.readouterr().err == 'pyvista is not installed: pip install ".[view]"\n'
+
+
+def test_scaling_3d(tmp_path: Path) -> None:
+    """A run's phases add up, and two of them make a table."""
+    demo = runpy.run_path(str(ROOT / "demos" / "scaling_3d.py"))
+    row = demo["measure"](demo["Cell"](1, 16.0, until=20.0))
+    assert row["error"] is None
+    parts = demo["parts_of"]([row])
+    assert {"factor", "pairing", "linear"} <= set(parts)
+    assert sum(row[name] for name in parts) == pytest.approx(row["solve"])
+    assert min(row[name] for name in ("setup", "memory", "K_error", "reaction_error", *parts)) > 0
+    text = demo["write"](tmp_path, [row, row | {"ranks": 2, "solve": row["solve"] / 2}])
+    assert "| 2.00 |" in text
+    assert (tmp_path / "scaling.csv").read_text().count("\n") == 3
 
 
 def test_readme_lines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

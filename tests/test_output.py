@@ -15,10 +15,11 @@ import pytest
 from extrusion import cases, plots, run
 from extrusion.errors import InputError
 from extrusion.newton import Newton
-from extrusion.result import Result
+from extrusion.result import Result, Snapshots, element_name
 
 COMM = MPI.COMM_WORLD
 CASE = replace(cases.A.with_increment(10, 30), order=2, method="nitsche")
+QUARTER = replace(cases.G, size=13.0, sectors=4, increments=((15.0, 15.0), (5.0, 20.0)))
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +102,85 @@ def test_snapshots(result: Result) -> None:
     k = np.flatnonzero(np.linalg.norm(shots.points - CASE.profile.points["K"], axis=1) < 1e-9)
     np.testing.assert_allclose(shots.displacement[:, k[0]], result.point("K")[1:])
     assert shots.von_mises.shape == (2, 510)
+
+
+@pytest.fixture(scope="module")
+def quarter(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+    """A run in three dimensions on all ranks, on 20-node hexahedra."""
+    folder = Path(COMM.bcast(str(tmp_path_factory.mktemp("quarter"))))
+    result = run(QUARTER, out=folder)
+    COMM.barrier()
+    return folder, result
+
+
+@pytest.mark.mpi
+def test_files_in_space(quarter: tuple[Path, Result]) -> None:
+    """Tables with x, y, z, fields, and the same pictures as of a half-plane; K is that of the result."""
+    folder, result = quarter
+    assert result.converged, result.error
+    contact = table(folder / "contact.csv")
+    now, state = contact["t"] == 20, result.steps[-1].zones["1"]
+    np.testing.assert_array_equal(np.stack([contact[axis][now] for axis in "xyz"], axis=1), state.x)
+    np.testing.assert_array_equal(contact["pressure"][now], state.pressure)
+    assert np.ptp(contact["z"]) > 45
+    history = table(folder / "history.csv")
+    np.testing.assert_array_equal(np.stack([history["u_r_K"], history["u_y_K"]], axis=1), result.point("K"))
+    assert sum(file.stat().st_size for file in (folder / "fields.bp").iterdir()) > 100_000
+    pytest.importorskip("matplotlib")
+    if COMM.rank == 0:
+        before = [(folder / f"{kind}.png").read_bytes() for kind in plots.KINDS]
+        assert min(map(len, before)) > 20_000
+        assert [path.read_bytes() for path in plots.write(plots.Record.read(folder), folder)] == before
+
+
+def by_place(shots: Snapshots) -> np.ndarray:
+    """A row a triangle: body, places, displacements and stresses at all t; in the order of body and places."""
+    u = shots.displacement[:, shots.triangles].transpose(1, 0, 2, 3).reshape(len(shots.triangles), -1)
+    places = np.round(shots.points[shots.triangles].reshape(-1, 6), 6)
+    rows = np.column_stack([shots.billet, places, u, shots.von_mises.T])
+    return np.asarray(rows[np.lexsort(rows[:, :7].T)])
+
+
+@pytest.mark.mpi
+def test_snapshots_in_space(quarter: tuple[Path, Result]) -> None:
+    """The plane z = 0, each of its vertices once, and the same on any number of ranks."""
+    _, result = quarter
+    if COMM.rank != 0:
+        assert result.snapshots is None
+        return
+    shots = result.snapshots
+    assert shots is not None
+    np.testing.assert_array_equal(shots.t, [20])
+    a, b, c = (shots.points[shots.triangles[:, i]] for i in range(3))
+    area = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    assert area[shots.billet].sum() == pytest.approx(50 * 65)
+    profile = QUARTER.profile
+    outline = np.array([vertex[1:] for vertex in profile.die])
+    turned = np.roll(outline, -1, axis=0)
+    whole = 0.5 * abs(np.sum(outline[:, 0] * turned[:, 1] - outline[:, 1] * turned[:, 0]))
+    assert area[~shots.billet].sum() == pytest.approx(whole)
+    assert len(np.unique(np.column_stack([shots.points, _in_billet(shots)]), axis=0)) == len(shots.points)
+    alone = run(QUARTER, comm=MPI.COMM_SELF).snapshots
+    assert alone is not None
+    np.testing.assert_allclose(by_place(shots), by_place(alone), rtol=1e-6, atol=1e-6)
+
+
+def _in_billet(shots: Snapshots) -> np.ndarray:
+    return np.isin(np.arange(len(shots.points)), shots.triangles[shots.billet])
+
+
+def test_rings() -> None:
+    """Points at about the same y make one ring; points farther off the next one."""
+    y, p = np.array([5.1, 1.0, 5.0, 1.05, 5.15]), np.array([3.0, 1.0, 6.0, 2.0, 3.0])
+    np.testing.assert_allclose(plots.rings(y, p, 0.2), [[1.025, 5.25 - 1 / 6], [1.5, 4], [1, 3], [2, 6]])
+
+
+@pytest.mark.parametrize(
+    ("case", "name"),
+    [(cases.A, "P1"), (cases.E, "P2"), (cases.B, "Q1"), (replace(cases.B, order=2), "Q2"), (cases.G, "20-node")],
+)
+def test_element_names(case: cases.Case, name: str) -> None:
+    assert element_name(case) == name
 
 
 def test_von_mises_of_a_free_billet() -> None:

@@ -54,7 +54,7 @@ def test_json(result: Result) -> None:
     text = json.dumps(result.to_dict(), allow_nan=False)
     data = json.loads(text)
     assert " ".join(data) == "case method order die dofs contact_points ranks solver converged seconds estimate steps"
-    assert list(data["seconds"]) == ["setup", "solve", "output", "factor", "condensation"]
+    assert list(data["seconds"]) == ["setup", "solve", "output", "factor", "condensation", "pairing"]
     step, last = data["steps"][-1], result.steps[-1]
     assert " ".join(step) == "t points reaction energy iterations cuts gap"
     assert step["points"]["K"] == list(last.points["K"])
