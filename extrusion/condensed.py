@@ -61,21 +61,44 @@ def choose(problem: Problem, solver: str = "auto") -> System:
     if solver == "iterative":
         problem.iterate()
         return problem
-    condensed = Condensed(problem)
-    cost, memory = condensed.cost, condensed.memory
+    fits = surface_memory(problem) <= MEMORY_SHARE * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    iterates = problem.dim == 3 and not problem.case.mixed
     iterations = ITERATIONS * len(problem.case.times())
-    surface, full = cost.condensation + iterations * cost.surface, iterations * cost.full
-    fits = memory <= MEMORY_SHARE * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    chosen = "surface" if solver == "surface" or (surface < full and fits) else "full"
+    seconds = {"iterative": iterations * ITERATIVE_RATE * problem.dofs / problem.comm.size} if iterates else {}
+    condensed = None
+    if fits or not iterates or solver == "surface":  # what would not fit is not factored to know it
+        condensed = Condensed(problem)
+        cost = condensed.cost
+        seconds["surface"] = cost.condensation + iterations * cost.surface
+        seconds["full"] = iterations * cost.full
+    allowed = {name: s for name, s in seconds.items() if name != "surface" or fits}
+    chosen = "surface" if solver == "surface" else min(allowed, key=allowed.__getitem__)
     if problem.comm.rank == 0:
         log.info(
-            "solver %s: %d of %d unknowns can carry contact forces, at most %.0f MB; estimated %.2g s on the surface, "
-            "%.2g s on all unknowns%s",
-            chosen, condensed.n_forces, problem.dofs, memory / 1e6, surface, full,
-            "" if fits else "; the surface's matrices would not fit",
-        )  # fmt: skip
-    return condensed if chosen == "surface" else problem
+            "solver %s: the forces of contact take up to %.0f MB on the surface%s; estimated %s",
+            chosen,
+            surface_memory(problem) / 1e6,
+            "" if fits else ", too many here",
+            ", ".join(f"{name} {value:.2g} s" for name, value in sorted(seconds.items(), key=lambda item: item[1])),
+        )
+    if chosen == "iterative":
+        problem.iterate()
+    return condensed if condensed is not None and chosen == "surface" else problem
 
+
+def surface_memory(problem: Problem) -> float:
+    """Bytes of the compliance with all of its columns, body by body."""
+    full = np.zeros(problem.n_z, dtype=bool)
+    full[np.concatenate([term.forced for term in problem.terms])] = True
+    n_u = problem.dim * len(problem.z_in_billet)
+    in_billet = np.ones(problem.n_z, dtype=bool)
+    in_billet[:n_u] = np.repeat(problem.z_in_billet, problem.dim)
+    free = problem.z_free & (np.arange(problem.n_z) < problem.n_z - problem.n_multipliers)
+    return 8.0 * sum(int((full & free & body).sum()) * int((free & body).sum()) for body in (in_billet, ~in_billet))
+
+
+ITERATIVE_RATE = 6e-5
+"""Seconds an unknown that an iteration of Newton's method takes with multigrid, on one core (EPYC, 2026)."""
 
 ITERATIONS = 5
 """Newton iterations an increment that the choice of a solver counts with."""
@@ -198,12 +221,6 @@ class Condensed(System):
             self.n_forces,
             self.n_read,
         )
-
-    @property
-    def memory(self) -> float:
-        """Bytes of the compliance with all of its columns."""
-        columns = np.bincount(self.force_body, minlength=2)
-        return 8.0 * sum(int(n) * (body.stop - body.start) for n, body in zip(columns, self.bodies, strict=True))
 
     @property
     def right_hand_sides(self) -> int:

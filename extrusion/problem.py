@@ -23,7 +23,7 @@ import dolfinx.fem.petsc
 import ufl
 from dolfinx import fem
 
-from extrusion.cases import LOCKING_FROM, Case, Zone
+from extrusion.cases import GAMMA, LOCKING_FROM, Case, Zone
 from extrusion.contact import REFERENCE_NU, stiffness
 from extrusion.elasticity import (
     epsilon,
@@ -97,7 +97,9 @@ class Problem(System):
         self._gather_contact()
         self._lay_out()
         self._krylov: Krylov | None = None
-        if case.method == "nitsche" and case.theta != -1:
+        # in space it takes a factorisation of everything, and the default is known to be safe
+        known = self.dim == 3 and case.theta == 0 and case.contact_gamma >= GAMMA["nitsche"]
+        if case.method == "nitsche" and case.theta != -1 and not known:
             self._refuse_indefinite()
 
     # -- bulk ------------------------------------------------------------------------------------------------
@@ -458,13 +460,15 @@ class Problem(System):
 
             ksp.setTolerances(rtol=ROUGH_RTOL if rough else RTOL, atol=0.3 * tolerance, max_it=400)
 
+    @property
+    def iterates(self) -> bool:
+        """Whether it does as `iterate` says."""
+        return self._krylov is not None
+
     def iterate(self) -> None:
         """From now on solve the tangent's linear systems by a Krylov method instead of factoring them."""
         from extrusion.krylov import Krylov
 
-        if self.dim == 2 or self.case.mixed:
-            why = "is for three dimensions" if self.dim == 2 else "is for the displacement form"
-            raise InputError("solver", "iterative", f"{why}: choose surface, full or auto")
         self._krylov = Krylov(self)
 
     def agreed(self, yes: bool) -> bool:

@@ -88,7 +88,7 @@ class Result:
     ranks: int
     converged: bool
     error: str | None  # why the run stopped early
-    solver: str  # surface or full
+    solver: str  # surface, full or iterative
     seconds: dict[str, float]  # setup, solve, output; of solve: on the surface factor and condensation, and pairing
     snapshots: Snapshots | None = field(repr=False, compare=False)  # rank 0; None without accepted steps
     estimate: Estimate | None = None  # how far off it is, if the model was chosen for a tolerance
@@ -304,7 +304,8 @@ def run(
         observers: Called as ``observer(problem, step)`` after each accepted step.
         out: Folder for files and pictures; without it nothing is written.
         solver: "surface" (the bulk factored once, Newton's method on the forces of contact), "full" (on all unknowns),
-            or "auto": the one that is estimated to be cheaper. Both give the same answer.
+            "iterative" (these by multigrid, in 3D), or "auto": the one that is estimated to be cheapest. All give the
+            same answer.
         tolerance: Relative error of the goal for which the cheapest model is chosen (die, order, size, zones), in place
             of the case's own; the result has the `Estimate`.
         goal: "K" (its u_y) or "reaction".
@@ -335,6 +336,9 @@ def run(
     given = str(mesh) if isinstance(mesh, str | Path) else None
     plain = None if isinstance(mesh, str | Path) else mesh
     case = changed(case, mesh=given, **changes)
+    if solver == "iterative" and (case.space != "3d" or case.mixed):
+        why = "the displacement form" if case.space == "3d" else "space = '3d'"
+        raise InputError("solver", solver, f"is for {why}: choose surface, full or auto")
     estimate = None
     if adapt and tolerance is None:
         raise InputError("adapt", adapt, "give a tolerance too: the mesh is refined until the goal has it")
@@ -387,7 +391,7 @@ def run(
         ranks=comm.size,
         converged=error is None,
         error=error,
-        solver="surface" if system is not problem else "full",
+        solver="surface" if system is not problem else "iterative" if problem.iterates else "full",
         seconds=seconds,
         snapshots=camera.snapshots(),
         estimate=estimate,
