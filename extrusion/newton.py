@@ -138,7 +138,7 @@ class Newton:
         self.history, self._update, self._fresh, self._holds = [], np.inf, False, False
         self.problem.hold(None)
         self.tolerance = max(self.atol, self.problem.round_off(x))
-        self.problem.set_accuracy(self.snes.getKSP(), self.tolerance, at_most is not None)
+        self.problem.set_accuracy(self.snes.getKSP(), self.tolerance)
         predicted = self._predict(x)
         self.snes.solve(None, x)
         iterations = self.snes.getIterationNumber() + predicted

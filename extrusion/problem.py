@@ -453,12 +453,11 @@ class Problem(System):
         if self._krylov is not None:
             self._displacements_only.reset()
 
-    def set_accuracy(self, ksp: PETSc.KSP, tolerance: float, rough: bool) -> None:
-        """No more of it than Newton's method, which ends at this residual, can use."""
+    def set_accuracy(self, ksp: PETSc.KSP, tolerance: float) -> None:
         if self._krylov is not None:
-            from extrusion.krylov import ROUGH_RTOL, RTOL
+            from extrusion.krylov import RTOL
 
-            ksp.setTolerances(rtol=ROUGH_RTOL if rough else RTOL, atol=0.3 * tolerance, max_it=400)
+            ksp.setTolerances(rtol=RTOL, atol=0.3 * tolerance, max_it=400)
 
     @property
     def iterates(self) -> bool:
@@ -484,6 +483,11 @@ class Problem(System):
     def x_rows(self) -> Index:
         """Where this rank's x holds them."""
         return self._x_mine[self._z_row[self._z_mine]]
+
+    @property
+    def held_rows(self) -> Index:
+        """Where this rank's x holds what the supports prescribe."""
+        return self._held
 
     def bulk_times(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """K x into y; at the supports x itself."""

@@ -73,14 +73,8 @@ class System(ABC):
     def set_solver(self, ksp: PETSc.KSP) -> None:
         """Say how the tangent's linear systems are solved."""
 
-    def set_accuracy(self, ksp: PETSc.KSP, tolerance: float, rough: bool) -> None:  # noqa: B027
-        """Say how closely the next linear systems are to be solved, where that is a choice.
-
-        Args:
-            ksp: The solver.
-            tolerance: Of Newton's residual, N.
-            rough: Whether the equations will change before that is reached.
-        """
+    def set_accuracy(self, ksp: PETSc.KSP, tolerance: float) -> None:  # noqa: B027
+        """Solve the next linear systems no closer than Newton's method needs, which ends at this residual, N."""
 
     @abstractmethod
     def tangent_without_contact(self) -> PETSc.Mat:
