@@ -90,6 +90,7 @@ class Krylov:
         P.setNearNullSpace(self._modes)
         if self._pc is not None:
             self._pc.destroy()
+        problem.let_go()
         pc = PETSc.PC().create(problem.comm)
         pc.setOptionsPrefix("extrusion_bulk_")
         pc.setType("gamg")

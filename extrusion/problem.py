@@ -79,6 +79,11 @@ class Problem(System):
                 "order = 1 at nu = %g: linear triangles lock: pressure and reaction are far off, use order 2",
                 case.billet.nu,
             )
+        pressed = case.method == "nodal" and any(zone.contact == "unilateral" for zone in case.zones)
+        if case.element == "serendipity" and pressed and comm.rank == 0:
+            log.warning("20-node hexahedra under nodal pressure: its vertices pull, use nitsche or mortar")
+        if case.space == "3d" and case.order == 1 and case.method != "nodal" and comm.rank == 0:
+            log.warning("order = 1 in 3D: facets are chords of the circle, and contact holds these: use order 2")
         bodies = ("billet", "die") if case.die == "elastic" else ("billet",)
         self.tagged: TaggedMesh = _distributed(case, mesh, comm, bodies)
         self.bodies = bodies
@@ -452,6 +457,12 @@ class Problem(System):
         self._tangent.reset()
         if self._krylov is not None:
             self._displacements_only.reset()
+        self.let_go()
+
+    def let_go(self) -> None:
+        """Free matrices that are no longer held: on several ranks petsc4py keeps them until all ranks say so."""
+        if self.comm.size > 1:
+            PETSc.garbage_cleanup(self.comm)
 
     def set_accuracy(self, ksp: PETSc.KSP, tolerance: float) -> None:
         if self._krylov is not None:

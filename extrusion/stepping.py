@@ -166,7 +166,8 @@ def _increment(problem: System, newton: Newton, accepted: PETSc.Vec) -> _Attempt
     iterations, change = 0, x.duplicate()
     seen: list[float] = []
     previous = x.duplicate()
-    rough = frozen  # while the pairing still changes much, few iterations are as good as many
+    # while the pairing still changes much, few iterations are as good as many: worth it where they are dear
+    rough = frozen and problem.case.space == "3d"
     for attempt in range(1, PASSES + 1):
         problem.pair_up(x, settle=attempt > (SETTLE if frozen else 1))
         x.copy(previous)

@@ -291,6 +291,19 @@ def reported(system: Any, times: list[float]) -> tuple[list[list[float]], Step]:
     return rows, step
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "mixed"])
+def test_iterative_is_surface(name: str) -> None:
+    """Multigrid in place of factors, on one rank and on two; what it is solved to is Newton's tolerance (1e-6 N)."""
+    times = [5.0, 15.0, 25.0]
+    expected, _ = reported(Condensed(in_space(**SCENES[name], comm=MPI.COMM_WORLD)), times)
+    problem = in_space(**SCENES[name], comm=MPI.COMM_WORLD)
+    problem.iterate()
+    found, step = reported(problem, times)
+    assert_allclose(found, expected, rtol=0, atol=1e-7)
+    assert step.cuts == 0
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_surface_is_full(name: str) -> None:
     """The condensed problem's steps are those of the full one, everywhere in the bodies."""
