@@ -39,3 +39,26 @@ for name, case in CASES.items():
         stopped = "" if result.converged else f" (stopped at t = {result.t[-1]:g})"
         cells += [str(result.dofs), f"{result.iterations.sum()}{stopped}", f"{seconds[-1]:.2f}", f"{K:.2g}", f"{R:.2g}"]
     print(f"| {' | '.join(cells)} | {seconds[0] / seconds[1]:.0f} |", flush=True)
+
+# %% [markdown]
+# The error by size of element: order 2 on the sheet's divisions, on 0.6 and on twice as many, rigid die (minutes).
+
+
+# %%
+def divided(case, by):
+    """Every edge of the profile, and the quarter turn, in so many times as many parts."""
+    divisions = tuple((a, b, max(1, round(n * by))) for a, b, n in case.profile.divisions)
+    return replace(case, profile=replace(case.profile, divisions=divisions), sectors=2 * round(5 * by))
+
+
+print("\n| method | divisions | dofs | solves | s | K % | R % |")
+print("|---|---:|---:|---:|---:|---:|---:|")
+for method in ("nitsche", "mortar"):
+    for by in (0.6, 1.0, 2.0):
+        scene = replace(cases.B, method=method, order=2, die="rigid", figures=())
+        result = run(divided(scene, by), solver="surface")
+        found = {step.t: (step.points["K"][1], step.reaction) for step in result.steps}
+        rows = reference.errors(known["unilateral"]["rigid"], found).values()
+        K, R = (100 * max(row[i] for row in rows) for i in (0, 2))
+        cells = (by, result.dofs, result.iterations.sum(), f"{result.seconds['solve']:.0f}", f"{K:.2g}", f"{R:.2g}")
+        print(f"| {method} | {' | '.join(map(str, cells))} |", flush=True)
