@@ -118,26 +118,9 @@ def plain_mesh(
     def refuse(what: str) -> InputError:
         return InputError("mesh", origin, what)
 
-    x = np.array(points, dtype=float)
-    bodies = {name: np.array(c, dtype=np.int64).reshape(-1, 3) for name, c in cells.items()}
-    groups = {name: np.array(f, dtype=np.int64).reshape(-1, 2) for name, f in facets.items()}
-    bodies, groups = ({k: v for k, v in d.items() if len(v)} for d in (bodies, groups))
-    for known, given in ((("billet", "die"), bodies), (FACETS, groups)):
-        for name in given:
-            if name not in known:
-                raise refuse(f"has an unknown group {name!r}; groups are {', '.join(known)}")
-    if not bodies:
-        raise refuse("has no triangles in a group billet or die")
-
-    used = np.unique(np.concatenate([c.ravel() for c in bodies.values()]))
-    if used[0] < 0 or used[-1] >= len(x):
-        raise refuse(f"has {len(x)} nodes, but a triangle of nodes {used[0]} to {used[-1]}")
-    if not np.all(np.isfinite(x[used])):
-        raise refuse("has nodes that are not finite; mesh it again")
+    x, bodies, groups, used = checked_nodes(points, cells, facets, FACETS, {"triangles": 3, "edges": 2}, refuse)
     if np.min(x[used, 0]) < -1e-9 * np.max(np.abs(x[used])):
         raise refuse(f"has a node at r = {np.min(x[used, 0]):g}; r is the first coordinate and r >= 0")
-    if len(bodies) == 2 and np.intersect1d(bodies["billet"], bodies["die"]).size:
-        raise refuse("has nodes that belong to billet and die; mesh the bodies apart")
 
     for name, triangles in bodies.items():
         a, b, c = (x[triangles[:, i]] for i in range(3))
@@ -165,6 +148,48 @@ def plain_mesh(
     new = np.full(len(x), -1)
     new[used] = np.arange(len(used))
     return PlainMesh(x[used], {k: new[c] for k, c in bodies.items()}, {k: new[f] for k, f in groups.items()})
+
+
+def checked_nodes(
+    points: npt.ArrayLike,
+    cells: Mapping[str, npt.ArrayLike],
+    facets: Mapping[str, npt.ArrayLike],
+    known: Mapping[str, str],
+    widths: Mapping[str, int],
+    refuse: Callable[[str], InputError],
+) -> tuple[Array, dict[str, Indices], dict[str, Indices], Indices]:
+    """Nodes, cells of each body and facets of each group as arrays, empty groups dropped; and which nodes are used.
+
+    Args:
+        points: Nodes, mm.
+        cells: Cells of each body.
+        facets: Facets of each group.
+        known: Facet groups that there can be.
+        widths: What cells and facets are called, and how many nodes they have.
+        refuse: Makes the error.
+
+    Raises:
+        InputError: A group is unknown, there are no cells, a node is missing or not finite, or bodies share nodes.
+    """
+    (kind, of_cell), (_, of_facet) = widths.items()
+    x = np.array(points, dtype=float)
+    bodies = {name: np.array(c, dtype=np.int64).reshape(-1, of_cell) for name, c in cells.items()}
+    groups = {name: np.array(f, dtype=np.int64).reshape(-1, of_facet) for name, f in facets.items()}
+    bodies, groups = ({k: v for k, v in d.items() if len(v)} for d in (bodies, groups))
+    for allowed, given in ((("billet", "die"), bodies), (known, groups)):
+        for name in given:
+            if name not in allowed:
+                raise refuse(f"has an unknown group {name!r}; groups are {', '.join(allowed)}")
+    if not bodies:
+        raise refuse(f"has no {kind} in a group billet or die")
+    used = np.unique(np.concatenate([c.ravel() for c in bodies.values()]))
+    if used[0] < 0 or used[-1] >= len(x):
+        raise refuse(f"has {len(x)} nodes, but a cell of nodes {used[0]} to {used[-1]}")
+    if not np.all(np.isfinite(x[used])):
+        raise refuse("has nodes that are not finite; mesh it again")
+    if len(bodies) == 2 and np.intersect1d(bodies["billet"], bodies["die"]).size:
+        raise refuse("has nodes that belong to billet and die; mesh the bodies apart")
+    return x, bodies, groups, used
 
 
 def _area(a: Array, b: Array, c: Array) -> Array:
@@ -435,7 +460,7 @@ def read_mesh(path: str | Path, needed: Sequence[str] = ()) -> PlainMesh:
 
     try:
         raw = (meshio.gmsh if suffix == ".msh" else meshio.med).read(path)
-        named = list(_named_cells(raw))
+        named = list(named_cells(raw))
     except Exception as error:  # meshio's readers fail in as many ways as there are broken files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise refuse(f"cannot be read as a mesh ({reason}); write it again") from None
@@ -464,7 +489,7 @@ def read_mesh(path: str | Path, needed: Sequence[str] = ()) -> PlainMesh:
     return plain_mesh(points[:, :2], bodies, edges, origin=str(path))
 
 
-def _named_cells(raw: Any) -> Iterator[tuple[str, str, Indices]]:
+def named_cells(raw: Any) -> Iterator[tuple[str, str, Indices]]:
     """(group, cell type, connectivity) of a meshio mesh, once for every group and block of cells."""
     for i, block in enumerate(raw.cells):
         data = np.ascontiguousarray(block.data, dtype=np.int64)
@@ -475,7 +500,7 @@ def _named_cells(raw: Any) -> Iterator[tuple[str, str, Indices]]:
             chosen = {n: np.isin(tags, [t for t, f in raw.cell_tags.items() if n in f]) for n in names}
         elif "gmsh:physical" in raw.cell_data:
             tags = np.asarray(raw.cell_data["gmsh:physical"][i])
-            dim = {"vertex": 0, "line": 1, "line3": 1}.get(block.type, 2)
+            dim = 3 if block.type.startswith(SOLID) else {"vertex": 0, "line": 1, "line3": 1}.get(block.type, 2)
             chosen = {n: tags == tag for n, (tag, d) in raw.field_data.items() if d == dim}
         for name, sets in raw.cell_sets.items():  # MSH 4.1: an entity may be in several groups
             if not name.startswith("gmsh:") and sets[i] is not None:

@@ -27,7 +27,7 @@ from dolfinx.graph import adjacencylist
 from dolfinx.io.utils import distribute_entity_data
 
 from extrusion.errors import InputError
-from extrusion.mesh import ALIASES, SOLID, TAGS, Indices, TaggedMesh, _named_cells, on_root
+from extrusion.mesh import ALIASES, SOLID, TAGS, Indices, TaggedMesh, checked_nodes, named_cells, on_root
 from extrusion.profile import Array, Edge, Profile
 
 FACETS_3D = {
@@ -109,24 +109,8 @@ def plain_hexes(
     def refuse(what: str) -> InputError:
         return InputError("mesh", origin, what)
 
-    x = np.array(points, dtype=float)
-    bodies = {name: np.array(c, dtype=np.int64).reshape(-1, (order + 1) ** 3) for name, c in cells.items()}
-    groups = {name: np.array(f, dtype=np.int64).reshape(-1, 4) for name, f in facets.items()}
-    bodies, groups = ({k: v for k, v in d.items() if len(v)} for d in (bodies, groups))
-    for known, given in ((("billet", "die"), bodies), (FACETS_3D, groups)):
-        for name in given:
-            if name not in known:
-                raise refuse(f"has an unknown group {name!r}; groups are {', '.join(known)}")
-    if not bodies:
-        raise refuse("has no hexahedra in a group billet or die")
-
-    used = np.unique(np.concatenate([c.ravel() for c in bodies.values()]))
-    if used[0] < 0 or used[-1] >= len(x):
-        raise refuse(f"has {len(x)} nodes, but a cell of nodes {used[0]} to {used[-1]}")
-    if not np.all(np.isfinite(x[used])):
-        raise refuse("has nodes that are not finite; mesh it again")
-    if len(bodies) == 2 and np.intersect1d(bodies["billet"], bodies["die"]).size:
-        raise refuse("has nodes that belong to billet and die; mesh the bodies apart")
+    widths = {"hexahedra": (order + 1) ** 3, "quadrilaterals": 4}
+    x, bodies, groups, used = checked_nodes(points, cells, facets, FACETS_3D, widths, refuse)
 
     for name, c in bodies.items():
         least, most = scaled_jacobians(x, c, order)
@@ -522,9 +506,7 @@ def read_hex(path: str | Path, needed: Sequence[str] = (), on_circle: bool = Fal
 
     try:
         raw = (meshio.gmsh if suffix == ".msh" else meshio.med).read(path)
-        # `_named_cells` takes what is no line for a surface: call volumes surfaces. Kinds tell them apart below
-        raw.field_data = {name: (tag, min(dim, 2)) for name, (tag, dim) in raw.field_data.items()}
-        named = list(_named_cells(raw))
+        named = list(named_cells(raw))
     except Exception as error:  # meshio's readers fail in as many ways as there are broken files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise refuse(f"cannot be read as a mesh ({reason}); write it again") from None
