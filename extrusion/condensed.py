@@ -15,11 +15,13 @@ of C are made when a force first needs them. Everything dense is on rank 0; the 
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
 import time
 import weakref
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from mpi4py import MPI  # noqa: F401  the wheel's PETSc needs the MPI that it loads
@@ -28,6 +30,7 @@ from petsc4py import PETSc
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+from dolfinx.fem.petsc import get_petsc_lib
 
 from extrusion.errors import InputError
 from extrusion.gap import Array, Index
@@ -38,10 +41,10 @@ log = logging.getLogger(__name__)
 
 SOLVERS = ("auto", "surface", "full", "iterative")
 
-BLOCK = 128
+BLOCK = 256
 """Right-hand sides that are solved for together."""
 
-MARGIN = 32
+MARGIN = 128
 """Forces along the surface, to both sides of those that are needed, that are made ready with them."""
 
 
@@ -481,38 +484,36 @@ class _Factor:
         entries = float(self._F.getMumpsInfog(29))
         self.entries = -1e6 * entries if entries < 0 else entries  # as MUMPS counts large ones
         self.flops = float(self._F.getMumpsRinfog(3))
-        self._X: PETSc.Mat | None = None
 
     def _at(self, entries: Index) -> Index:
         return np.asarray(self._order[np.searchsorted(self._rows, entries, sorter=self._order)])
 
     def solve(self, forces: Index, read: Index) -> Array:
-        """Entries ``read`` of the solution for a unit force at each of ``forces`` (a row each); on rank 0."""
-        comm, n, size = self._comm, self._A.size[0], len(forces)
-        first, end = self._A.owner_range
+        """Entries ``read`` of the solution for a unit force at each of ``forces`` (a row each); on rank 0.
+
+        As entries of the inverse, for which MUMPS visits only the fronts between these unknowns and the tree's root.
+        Amestoy, Duff, L'Excellent, Robert, Rouet, Ucar, SIAM J. Sci. Comput. 34 (2012) A1975, doi:10.1137/100799411.
+        """
+        comm, n = self._comm, self._A.size[0]
         at, wanted = self._at(forces), self._at(read)
-        if self._X is None or self._X.size[1] != size:
-            self._X = PETSc.Mat().createDense(((end - first, n), (None, size)), comm=comm)
-            self._X.setUp()
-            self._X.assemble()
-        X = self._X
-        if comm.size == 1:  # sparse right-hand sides cost half, but MUMPS wants them on one rank
-            csr = np.arange(size + 1, dtype=PETSc.IntType), at.astype(PETSc.IntType), np.ones(size)
-            B = PETSc.Mat().createTranspose(PETSc.Mat().createAIJ((size, n), csr=csr, comm=comm))
-        else:
-            B = X.duplicate()
-            mine = (at >= first) & (at < end)
-            B.getDenseArray()[at[mine] - first, np.flatnonzero(mine)] = 1.0
-            B.assemble()
-        self._F.matSolve(B, X)
-        B.destroy()
-        mine = np.flatnonzero((wanted >= first) & (wanted < end))
-        values = X.getDenseArray().T[:, wanted[mine] - first]
-        if comm.size == 1:
-            return np.asarray(values)
-        out = np.zeros((size, len(wanted)))
-        for where, part in comm.gather((mine, values)) or ():
-            out[:, where] = part
+        by_row, by_col = np.argsort(at), np.argsort(wanted)
+        m = n if comm.rank == 0 else 0
+        width = np.zeros(m + 1, dtype=PETSc.IntType)
+        cols = np.zeros(0, dtype=PETSc.IntType)
+        if comm.rank == 0:
+            width[1 + at] = len(wanted)
+            cols = np.tile(wanted[by_col], len(at)).astype(PETSc.IntType)
+        csr = np.cumsum(width, dtype=PETSc.IntType), cols, np.zeros(len(cols))
+        entries = PETSc.Mat().createAIJ(((m, n), (m, n)), csr=csr, comm=comm)
+        self._F.setMumpsIcntl(27, -64)  # right-hand sides that it takes together
+        if _petsc().MatMumpsGetInverseTranspose(self._F.handle, entries.handle):
+            raise RuntimeError("MUMPS did not give entries of the inverse")
+        self._F.setMumpsIcntl(30, 0)  # PETSc leaves both as they were here: entries only, all on rank 0
+        self._F.setMumpsIcntl(21, int(comm.size > 1))
+        out = np.zeros((len(at), len(wanted)) if comm.rank == 0 else (0, 0))
+        if comm.rank == 0:
+            out[np.ix_(by_row, by_col)] = entries.getValuesCSR()[2].reshape(out.shape)
+        entries.destroy()
         return out
 
     def back(self, forces: Index, values: Array) -> tuple[Index, Array]:
@@ -772,6 +773,14 @@ class _Tangent:
             turn += 1
         into[0] = b.array_r[0]
         into[1:] = x
+
+
+@cache
+def _petsc() -> ctypes.CDLL:
+    """PETSc's library, for what petsc4py leaves out."""
+    library = ctypes.CDLL(str(get_petsc_lib()))
+    library.MatMumpsGetInverseTranspose.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
+    return library
 
 
 def _place_in(values: Index, wanted: Index) -> Index:

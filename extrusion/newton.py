@@ -40,7 +40,7 @@ class Newton:
         atol: Absolute tolerance of the residual, N; not below the round-off of the forces that cancel in it.
         max_iterations: Linear solves before giving up.
         near: Largest update (mm) after which the second variation is used; by default half a facet, or the radius / 50.
-        predicts: Whether the first linear solve of an increment takes the contact set as it stood in the die.
+        predicts: Whether the first linear solve of an increment takes the contact set that is expected in the die.
     """
 
     def __init__(
@@ -132,39 +132,45 @@ class Newton:
             return int(reason.DIVERGED_MAX_IT)
         return int(reason.ITERATING)
 
-    def solve(self, x: PETSc.Vec, at_most: int | None = None) -> Outcome:
-        """Solve from x, in place; x already carries the supports' values. Or take ``at_most`` so many iterations."""
+    def solve(self, x: PETSc.Vec, at_most: int | None = None, ahead: float = 1.0) -> Outcome:
+        """Solve from x, in place; x already carries the supports' values.
+
+        Args:
+            x: Start and result.
+            at_most: Take no more than so many iterations.
+            ahead: The increment over the last one.
+        """
         self._limit = self._max if at_most is None else at_most
         self.history, self._update, self._fresh, self._holds = [], np.inf, False, False
         self.problem.hold(None)
         self.tolerance = max(self.atol, self.problem.round_off(x))
         self.problem.set_accuracy(self.snes.getKSP(), self.tolerance)
-        predicted = self._predict(x)
+        predicted = self._predict(x, ahead)
         self.snes.solve(None, x)
         iterations = self.snes.getIterationNumber() + predicted
         reason = self.snes.getConvergedReason()
         return Outcome(reason > 0, iterations, self.history[-1], REASONS.get(reason, str(reason)))
 
-    def _predict(self, x: PETSc.Vec) -> int:
-        """One linear solve with the accepted contact set, which stands still in the die as the billet slides by.
+    def _predict(self, x: PETSc.Vec, ahead: float) -> int:
+        """One linear solve with the contact set that is expected: it hardly moves in the die as the billet slides by.
 
         Newton's method would find the ends of the contact by steps of a few facets. Kept unless the residual grows.
 
         Returns:
             How many linear solves it took.
         """
-        if not self.predicts or not self.problem.expect(True):
+        if not self.predicts or not self.problem.expect(ahead):
             return 0
         y, ksp = self._trial, self.snes.getKSP()
         self.problem.residual(x, self._trial_f)
         before = float(self._trial_f.norm())
         if not np.isfinite(before):
-            self.problem.expect(False)
+            self.problem.expect(None)
             return 0
         A = self.problem.tangent(x, False)
         ksp.setOperators(A)
         ksp.solve(self._trial_f, y)
-        self.problem.expect(False)
+        self.problem.expect(None)
         moved = self.problem.largest_displacement(y)
         y.aypx(-1.0, x)
         self.problem.residual(y, self._trial_f)

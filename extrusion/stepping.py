@@ -79,7 +79,7 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
     problem.place_billet(x)
     caught = _caught(problem, 0.0)
     points = problem.named_points()
-    t, rate = 0.0, x.duplicate()
+    t, rate, last = 0.0, x.duplicate(), 0.0
     problem.shift_billet(rate, 1.0)  # du/dt that predicts the next increment: rigid at first, then that of the last one
     for target in times:
         cuts = iterations = passes = 0
@@ -92,10 +92,10 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
             x.axpy(dt, rate)
             problem.drive(x, goal)
             problem.forget_pattern()
-            outcome = _increment(problem, newton, accepted)
+            outcome = _increment(problem, newton, accepted, dt / last if last else 1.0)
             iterations += outcome.iterations
             if outcome.converged:
-                t, passes = goal, outcome.passes
+                t, passes, last = goal, outcome.passes, dt
                 problem.accept(x)
                 for zone, distance in _caught(problem, t).items():
                     caught[zone] = max(distance, caught[zone])
@@ -155,8 +155,10 @@ class _Attempt:
     remedy: str = "Try another --increment, a finer mesh, or --method nitsche or mortar on P2"
 
 
-def _increment(problem: System, newton: Newton, accepted: PETSc.Vec) -> _Attempt:
-    """Solve one predicted increment in place; with frozen pairing, by geometry passes (two at least, as the sheet).
+def _increment(problem: System, newton: Newton, accepted: PETSc.Vec, ahead: float) -> _Attempt:
+    """Solve one predicted increment, so many times the last one, in place.
+
+    With frozen pairing that takes geometry passes (two at least, as the sheet).
 
     Without, once is enough, unless a mortar row that is just leaving the die flips between held and let go: then these
     rows are frozen, and may only grow in number.
@@ -172,7 +174,7 @@ def _increment(problem: System, newton: Newton, accepted: PETSc.Vec) -> _Attempt
         problem.pair_up(x, settle=attempt > (SETTLE if frozen else 1))
         x.copy(previous)
         rough &= attempt <= ROUGH
-        outcome = newton.solve(x, AT_MOST if rough else None)
+        outcome = newton.solve(x, AT_MOST if rough else None, ahead)
         iterations += outcome.iterations
         if not outcome.converged and not (rough and np.isfinite(outcome.residual)):
             if attempt == 1 and problem.may_settle:

@@ -148,9 +148,12 @@ class System(ABC):
         for term in self.terms:
             term.hold(z)
 
-    def expect(self, on: bool) -> bool:
-        """Take the accepted contact set, where it stood in the die, as given; say if any zone has one."""
-        return any([term.expect(on) for term in self.terms])
+    def expect(self, ahead: float | None) -> bool:
+        """Take the contact set that is expected in the die as given; say if any zone has one. None: no more.
+
+        ``ahead``: this increment over the last one, by which the set's edges are moved on.
+        """
+        return any([term.expect(ahead) for term in self.terms])
 
     # -- reports ---------------------------------------------------------------------------------------------
 

@@ -56,8 +56,8 @@ class ContactTerm(Protocol):
     def accept(self, z: Array) -> None:
         """Make z the accepted state."""
 
-    def expect(self, on: bool) -> bool:
-        """Take the accepted contact set, where it stood in the die, for the one that will be; say if there is one."""
+    def expect(self, ahead: float | None) -> bool:
+        """Take the contact set that is expected in the die for given (`Expected.expect`); say if there is one."""
 
     def state(self, z: Array) -> ContactState:
         """Report at z."""
@@ -68,23 +68,88 @@ class ContactTerm(Protocol):
 
 @dataclass(frozen=True)
 class ContactSet:
-    """Which of some positions along the die (sorted, mm) are closed."""
+    """The closed stretches of a zone, by where along the die they begin and end."""
 
-    at: Array
-    closed: np.ndarray
+    first: bool  # whether what lies before all edges is closed
+    edges: Array  # increasing, mm
 
     @classmethod
-    def of(cls, at: Array | None, closed: np.ndarray) -> ContactSet | None:
-        """From positions in any order; None if there are none, or none is closed."""
+    def of(cls, at: Array | None, trial: Array, closed: np.ndarray) -> ContactSet | None:
+        """From positions in any order, their trial stress and whether they are closed; None if none is.
+
+        An edge stands where the trial stress, linear between the two points beside it, vanishes.
+        """
         if at is None or not np.any(closed):
             return None
         order = np.argsort(at, axis=None)
-        return cls(at.ravel()[order], closed.ravel()[order])
+        at, closed, size = (a.ravel()[order] for a in (at, closed, np.abs(trial)))
+        i = np.flatnonzero(closed[1:] != closed[:-1])
+        share = size[i] / np.maximum(size[i] + size[i + 1], np.finfo(float).tiny)
+        return cls(bool(closed[0]), at[i] + share * (at[i + 1] - at[i]))
 
     def __call__(self, at: Array | None) -> np.ndarray:
-        """Whether positions are closed: as the next known one is."""
+        """Whether positions are closed."""
         assert at is not None
-        return np.asarray(self.closed[np.minimum(np.searchsorted(self.at, at), len(self.at) - 1)])
+        return np.asarray((np.searchsorted(self.edges, at) % 2 == 1) != self.first)
+
+    def partners(self, other: ContactSet) -> Array:
+        """For each edge of another set the nearest one here of the same kind, to which it is the nearest; or NaN."""
+        out = np.full(len(other.edges), np.nan)
+        for closes in (True, False):
+            here, there = (np.flatnonzero((np.arange(len(of.edges)) % 2 == of.first) == closes) for of in (self, other))
+            if len(here) and len(there):
+                apart = np.abs(self.edges[here, None] - other.edges[there])
+                nearest = np.argmin(apart, axis=0)
+                mutual = np.argmin(apart, axis=1)[nearest] == np.arange(len(there))
+                out[there[mutual]] = self.edges[here[nearest[mutual]]]
+        return out
+
+
+class Expected:
+    """The contact set that an increment is expected to end with: the accepted one, its edges moved on as they did last.
+
+    Where an edge is new the accepted set only keeps closed what it holds; where all are known it also keeps the rest
+    open (`known`).
+    """
+
+    def __init__(self) -> None:
+        self._accepted: ContactSet | None = None
+        self._before: ContactSet | None = None
+        self._now: ContactSet | None = None
+        self._known = False
+
+    def accept(self, found: ContactSet | None) -> None:
+        """Take the set of an accepted step."""
+        self._before, self._accepted = self._accepted, found
+
+    def expect(self, ahead: float | None) -> bool:
+        """Expect a set, its edges moved on by so many times their last change, and say if there is one.
+
+        None: expect nothing any more.
+        """
+        now, before, self._known = self._accepted if ahead is not None else None, self._before, False
+        # the start has an edge at every other point that rests on the die
+        if now is not None and before is not None and len(before.edges) <= len(now.edges) + 2:
+            change = now.edges - before.partners(now)
+            self._known = not np.isnan(change).any()
+            edges = now.edges + (ahead or 0.0) * change
+            if self._known and np.all(np.diff(edges) > 0):
+                now = ContactSet(now.first, edges)
+        self._now = now
+        return now is not None
+
+    @property
+    def on(self) -> bool:
+        """Whether a set is expected."""
+        return self._now is not None
+
+    def law(self, trial: Array, at: Array | None) -> tuple[Array, Array]:
+        """As `extrusion.contact.project`, of points at these places along the die, with the set that is expected."""
+        assert self._now is not None
+        closed = self._now(at)
+        if not self._known:
+            closed |= trial < 0.0
+        return np.where(closed, trial, 0.0), closed.astype(float)
 
 
 class NodalContact:
@@ -126,7 +191,7 @@ class NodalContact:
     def hold(self, z: Array | None) -> None:
         pass
 
-    def expect(self, on: bool) -> bool:
+    def expect(self, ahead: float | None) -> bool:
         return False
 
     def stiffness_norm(self) -> float:
@@ -225,8 +290,7 @@ class IntegratedContact:
         self.forced = pair.forced(behind=bool(theta) and material is not None)
         self._radius, self._interpenetrating, self._order = radius, interpenetrating, order
         self.closed, self.caught = np.zeros(len(pair.slave.nodes), dtype=bool), 0.0
-        self._accepted: ContactSet | None = None
-        self._expects = False
+        self._expected = Expected()
         self._known: tuple[Array, tuple[Points, Array | None, Array | None]] | None = None
         self._held: Index | None = None
 
@@ -245,9 +309,17 @@ class IntegratedContact:
     def settled(self, z: Array) -> bool:
         return True
 
-    def expect(self, on: bool) -> bool:
-        self._expects = on and self._accepted is not None
-        return self._expects
+    def expect(self, ahead: float | None) -> bool:
+        return self._expected.expect(ahead)
+
+    def _found(self, z: Array) -> ContactSet | None:
+        points, S, _ = self._points(z)
+        k = self._k[points.facet][:, None]
+        trial = k * points.gap if S is None else k * points.gap + np.einsum("nql,nl->nq", S, z[points.cols])
+        closed = trial < 0.0
+        if not self.pair.extended:
+            closed &= ~points.past
+        return ContactSet.of(self.pair.along(z, points), trial, closed)
 
     def stiffness_norm(self) -> float:
         if self.pair.closure == "check":
@@ -277,10 +349,11 @@ class IntegratedContact:
         k = self._k[points.facet][:, None]
         own = np.einsum("nql,nl->nq", S, z[points.cols]) if S is not None else np.zeros_like(points.gap)
         held = np.broadcast_to(self.closed[points.facet][:, None], own.shape)
-        closure = self.pair.closure
-        if self._expects and self._accepted is not None:
-            held, closure = self._accepted(self.pair.along(z, points)), "bilateral"
-        sc, dsc = project(own + k * points.gap, closure, held)
+        trial = own + k * points.gap
+        if self._expected.on:
+            sc, dsc = self._expected.law(trial, self.pair.along(z, points))
+        else:
+            sc, dsc = project(trial, self.pair.closure, held)
         if not self.pair.extended:
             sc, dsc = np.where(points.past, 0.0, sc), np.where(points.past, 0.0, dsc)
         return own, sc, dsc, k
@@ -359,11 +432,11 @@ class IntegratedContact:
     def accept(self, z: Array) -> None:
         if self.pair.closure == "check":
             return
-        points, S, _ = self._points(z)
-        _, _, dsc, _ = self._law(z, points, S)
         if self.pair.closure == "unilateral":
-            self._accepted = ContactSet.of(self.pair.along(z, points), dsc > 0)
+            self._expected.accept(self._found(z))
         else:
+            points, S, _ = self._points(z)
+            _, _, dsc, _ = self._law(z, points, S)
             before = self.closed
             self.closed = before | self._whole_facets(points, dsc > 0)
             self.caught = _farthest(points.gap, (self.closed & ~before)[points.facet])
@@ -411,8 +484,7 @@ class MortarContact:
         self._radius, self._interpenetrating = radius, interpenetrating
         self.closed, self.caught = np.zeros(n, dtype=bool), 0.0
         self._settled: np.ndarray | None = None  # rows let go, where that is not left to each iterate
-        self._accepted: ContactSet | None = None
-        self._expects = False
+        self._expected = Expected()
         self._known: tuple[Array, Points] | None = None
         self._held: Index | None = None
 
@@ -471,10 +543,11 @@ class MortarContact:
 
     def _law(self, z: Array, points: Points) -> tuple[Array, Array, Array]:
         weak, share, w = self._rows(points)
-        held, closure = self.closed, self.pair.closure
-        if self._expects and self._accepted is not None:
-            held, closure = self._accepted(self.pair.along_corners(z)), "bilateral"
-        sc, dsc = project(self._total * z[self.at] + self._k * weak, closure, held)
+        trial = self._total * z[self.at] + self._k * weak
+        if self._expected.on:
+            sc, dsc = self._expected.law(trial, self.pair.along_corners(z))
+        else:
+            sc, dsc = project(trial, self.pair.closure, self.closed)
         free = self._free(share)
         return np.where(free, 0.0, sc), np.where(free, 0.0, dsc), w
 
@@ -544,9 +617,13 @@ class MortarContact:
             np.concatenate([J.ravel(), (dsc - 1.0) * self._total]),
         )
 
-    def expect(self, on: bool) -> bool:
-        self._expects = on and self._accepted is not None
-        return self._expects
+    def expect(self, ahead: float | None) -> bool:
+        return self._expected.expect(ahead)
+
+    def _found(self, z: Array) -> ContactSet | None:
+        weak, share, _ = self._rows(self._points(z))
+        trial = self._total * z[self.at] + self._k * weak
+        return ContactSet.of(self.pair.along_corners(z), trial, (trial < 0.0) & ~self._free(share))
 
     def stiff(self, z: Array) -> tuple[Triplets, Array]:
         kappa = self._k / self._total
@@ -565,8 +642,7 @@ class MortarContact:
 
     def accept(self, z: Array) -> None:
         if self.multipliers and self.pair.closure == "unilateral":
-            dsc = self._law(z, self._points(z))[1]
-            self._accepted = ContactSet.of(self.pair.along_corners(z), dsc > 0)
+            self._expected.accept(self._found(z))
         if self.multipliers and self.pair.closure == "bilateral":
             points, before = self._points(z), self.closed
             self.closed = (before | (self._law(z, points)[1] > 0)) & ~self._free(self._rows(points)[1])

@@ -96,10 +96,10 @@ def test_choice(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_prediction_saves_iterations() -> None:
-    """A contact set carried along with the billet instead of the die."""
+    """A fifth and more: the ends of the contact, which go on in the die as they did, are not found facet by facet."""
     system = Condensed(scene(replace(UNILATERAL, size=2.0)))
     times = list(np.arange(5.0, 101.0, 5.0))
     with_, without = (
         sum(s.iterations for s in steps(system, Newton(system, predicts=p), times)) for p in (True, False)
     )
-    assert with_ < 0.95 * without
+    assert with_ < 0.8 * without

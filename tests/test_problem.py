@@ -331,13 +331,13 @@ class Reluctant(Newton):
 
     solved = 0.0
 
-    def solve(self, x: PETSc.Vec, at_most: int | None = None) -> Outcome:
+    def solve(self, x: PETSc.Vec, at_most: int | None = None, ahead: float = 1.0) -> Outcome:
         t = float(x.array_r[self.problem._driven[0]])
         if t - self.solved > 12:
             x.set(np.nan)
             return Outcome(False, 3, np.inf, "too far")
         self.solved = t
-        return super().solve(x, at_most)
+        return super().solve(x, at_most, ahead)
 
 
 @pytest.mark.parametrize("law", ["nodal", "nitsche 0"])

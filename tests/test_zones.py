@@ -22,7 +22,9 @@ from extrusion.pairs import CurvePair, closed_at_start
 from extrusion.problem import Problem
 from extrusion.profile import SSNV504
 from extrusion.zones import (
+    ContactSet,
     ContactTerm,
+    Expected,
     IntegratedContact,
     NodalContact,
 )
@@ -306,3 +308,44 @@ def test_penalty_and_theta_1_derive_from_an_energy(
     side.closed = held
     asymmetry = np.linalg.norm(J - J.T) / np.linalg.norm(J)
     assert (asymmetry < 1e-11) == symmetric, asymmetry
+
+
+def test_contact_set_finds_its_edges_between_points() -> None:
+    at = np.array([[3.0, 1.0], [0.0, 2.0]])  # in any order
+    trial = np.array([[3.0, -1.0], [2.0, -1.0]])
+    found = ContactSet.of(at, trial, trial < 0)
+    assert found is not None
+    assert not found.first
+    assert_allclose(found.edges, [2 / 3, 2.25])
+    assert_array_equal(found(np.array([0.0, 1.0, 2.0, 2.5])), [False, True, True, False])
+    assert ContactSet.of(at, trial, trial > 9) is None
+    assert ContactSet.of(None, trial, trial < 0) is None
+
+
+def test_edges_of_two_sets_pair_with_the_nearest_of_their_kind() -> None:
+    before = ContactSet(True, np.array([10.0, 20.0, 30.0]))  # closed to 10, from 20 to 30
+    after = ContactSet(False, np.array([19.0, 29.0]))  # the first stretch is gone
+    assert_array_equal(before.partners(after), [20.0, 30.0])
+    assert_array_equal(after.partners(before), [np.nan, 19.0, 29.0])
+    assert_array_equal(after.partners(ContactSet(True, np.array([18.0]))), [29.0])
+
+
+def test_expected_set_goes_on_as_it_did() -> None:
+    expected, at, pulled = Expected(), np.array([0.5, 1.4, 1.6, 3.0]), np.ones(4)
+    assert not expected.expect(1.0)
+    expected.accept(ContactSet(True, np.array([1.0])))
+    assert expected.expect(1.0)  # all that is known is what was closed: points may close beside it
+    assert_array_equal(expected.law(pulled, at)[1], [1, 0, 0, 0])
+    assert_array_equal(expected.law(-pulled, at)[1], [1, 1, 1, 1])
+    expected.accept(ContactSet(True, np.array([1.2])))
+    for ahead, closed in ((1.0, [1, 1, 0, 0]), (1.9, [1, 1, 0, 0]), (2.1, [1, 1, 1, 0])):  # 1.2 + ahead * 0.2
+        assert expected.expect(ahead)
+        for trial in (pulled, -pulled):
+            stress, slope = expected.law(trial, at)
+            assert_array_equal(slope, closed)
+            assert_array_equal(stress, trial * closed)
+    expected.accept(ContactSet(True, np.array([1.0, 2.0, 2.5])))  # edges that were not there before
+    assert expected.expect(1.0)
+    assert_array_equal(expected.law(-pulled, at)[1], [1, 1, 1, 1])
+    assert not expected.expect(None)
+    assert not expected.on
