@@ -16,9 +16,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from extrusion.compiled import ray
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -61,14 +64,6 @@ class Surface:
         return np.asarray(along[first])
 
     @cached_property
-    def trace(self) -> Array:
-        """The cell's functions along the facet, then their derivatives, by powers of xi: ``shape=(m, k, 2 K)``."""
-        m, k = self.nodes.shape
-        out = np.zeros((m, k, 2, self.cell_nodes.shape[1]))
-        out[np.arange(m)[:, None], :, :, self.local] = SHAPES[k][:, :2].transpose(2, 0, 1)
-        return out.reshape(m, k, -1)
-
-    @cached_property
     def gradients(self) -> Array:
         """Gradients of the cell's functions along the facet, by powers of xi, 1/mm: ``shape=(m, k - 1, K, 2)``."""
         assert self.tabulate is not None
@@ -78,6 +73,22 @@ class Surface:
         table = self.tabulate(1, at.reshape(-1, 2))[1:].reshape(2, m, k, -1)
         K = np.linalg.inv(np.swapaxes(self.cell_X[:, 1:] - self.cell_X[:, :1], 1, 2))  # K[m, i, j] = d X_i(ref) / d x_j
         return np.einsum("ak,imkl,mij->malj", SHAPES[k][:-1, 0], table, K)
+
+    @cached_property
+    def _compiled(self) -> tuple[Any, list[Any]]:
+        """The ``surface`` of ``ray.h``, and what it points to."""
+        ffi = ray().ffi
+        (m, k), K = self.nodes.shape, self.cell_nodes.shape[1]
+        arrays: dict[str, Any] = {"X": self.X, "normal": self.normal, "length": self.length}
+        arrays |= {"nodes": self.nodes, "cells": self.cell_nodes, "local": self.local, "ends": self.facet_vertices}
+        if self.tabulate is not None:
+            arrays["gradients"] = self.gradients
+        out, held = ffi.new("surface *", {"m": m, "k": k, "K": K}), []
+        for name, array in arrays.items():
+            kind = "double" if array.dtype.kind == "f" else "int64_t"
+            held.append(np.ascontiguousarray(array, dtype=np.float64 if kind == "double" else np.int64))
+            setattr(out, name, ffi.cast(f"{kind} *", held[-1].ctypes.data))
+        return out, held
 
     def reversed(self) -> Surface:
         """The same facets in the opposite order, each with start and end exchanged."""
@@ -194,7 +205,6 @@ def ray_points(
     sign: float,
     order: int,
     axisymmetric: bool = True,
-    variation: bool = False,
 ) -> Points:
     """Quadrature points of the slave facets, split at every deformed die vertex, with the gap along a fixed ray.
 
@@ -218,109 +228,40 @@ def ray_points(
         sign: +1 if the die lies towards larger c.
         order: Gauss points in a piece.
         axisymmetric: Weights ``2 pi r ds`` (else ds).
-        variation: Compute the second-order terms.
 
     Raises:
         ArithmeticError: The deformed die is no graph over p (an iterate gone astray).
     """
-    p, c = 1 - axis, axis
-    u = z.reshape(-1, 2)
-    xs, xd = slave.X + u[slave.nodes], die.X + u[die.nodes]
-    vertex_p = np.append(xd[:, 0, p], xd[-1, 1, p])
-    if not (np.all(np.diff(vertex_p) > 0) and np.all(np.isfinite(xs))):
-        raise ArithmeticError("the deformed die is no graph over the ray's base line")
-
-    # 1. pieces: each slave facet, cut where it passes a die vertex (a facet that has turned over passes them backwards)
-    ends = xs[:, :2, p]
-    forward = ends[:, 0] <= ends[:, 1]
-    resting = 1e-12 * np.abs(vertex_p).max()  # a vertex this close to a facet's end is there, and cuts no sliver off
-    low = np.searchsorted(vertex_p, ends.min(axis=1) + resting, side="right")
-    high = np.searchsorted(vertex_p, ends.max(axis=1) - resting, side="left")
-    pieces = np.maximum(high - low, 0) + 1
-    facet = np.repeat(np.arange(len(xs)), pieces)
-    nth = np.arange(len(facet)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    # die facet opposite the piece (-1 and m: the extensions)
-    opposite = np.where(forward, low, high)[facet] - 1 + np.where(forward, 1, -1)[facet] * nth
-    m = len(xd)
-    e = np.clip(opposite, 0, m - 1)
-    after = opposite >= m
-    outside = (after | (opposite < 0))[:, None]
-    k_s, k_d = slave.nodes.shape[1], die.nodes.shape[1]
-    # by powers of place: x_s, x_s', N, N'; x_d, x_d', x_d'', M, M'
-    n_cell = slave.cell_nodes.shape[1]
-    of_s = np.concatenate([(SHAPES[k_s][:, :2].reshape(-1, k_s) @ xs).reshape(-1, k_s, 4), slave.trace], axis=2)
-    M = np.broadcast_to(SHAPES[k_d][:, :2].reshape(k_d, -1), (m, k_d, 2 * k_d))
-    of_d = np.concatenate([(SHAPES[k_d].reshape(-1, k_d) @ xd).reshape(-1, k_d, 6), M], axis=2)
-    # the cuts: pieces that begin there, and the vertex
-    begin = np.flatnonzero(nth)
-    f = facet[begin]
-    vertex = opposite[begin] + ~forward[f]
-    cut_s = of_s[f]
-    xi_cut = _root(cut_s[..., p].T, vertex_p[vertex])
-    xi0, xi1 = np.zeros(len(facet)), np.ones(len(facet))
-    xi0[begin] = xi1[begin - 1] = xi_cut
-
-    # 2. points and weights on the reference slave facet
+    library = ray()
+    ffi, vertex = library.ffi, np.empty(len(die.X) + 1)
     s, omega = gauss(order)
-    width = xi1 - xi0
-    xi = xi0[:, None] + width[:, None] * s
-    start, t = slave.X[facet, 0, :1], (slave.X[:, 1, :1] - slave.X[:, 0, :1])[facet]
-    length = slave.length[facet][:, None]
-    measure = width[:, None] * omega
-    jacobian = 2 * np.pi * (start + xi * t) * length if axisymmetric else np.broadcast_to(length, xi.shape)
+    z = np.ascontiguousarray(z)
 
-    # 3. the gap and its derivative at fixed xi
-    at = polynomial(xi, of_s[facet][:, None])
-    x_s, dx_s, N, dN = at[..., :2], at[..., 2:4], at[..., 4 : 4 + n_cell], at[..., 4 + n_cell :]
-    path = of_d[e]
-    k = np.where(outside, after[:, None], _root(path[..., p].T[..., None], x_s[..., p]))
-    at = polynomial(k, path[:, None])
-    x_d, dx_d, ddx_d, M, dM = at[..., :2], at[..., 2:4], at[..., 4:6], at[..., 6 : 6 + k_d], at[..., 6 + k_d :]
-    slope = np.where(outside, _reference_slope(die, axis)[e][:, None], dx_d[..., c] / dx_d[..., p])
-    excess = np.where(outside, x_s[..., p] - x_d[..., p], 0.0)
-    gap = sign * (x_d[..., c] + slope * excess - x_s[..., c])
-    both = np.concatenate([-N, M], axis=2)
-    s_ = slope[..., None]
-    # rows over nodes and components; a has only the component p, as have the derivatives of place and weight
-    rows = np.zeros((6 if variation else 1, *both.shape, 2))
-    G = rows[0]
-    G[..., c] = sign * both
-    G[..., p] = -s_ * G[..., c]
-    flat = rows.reshape(len(rows), *xi.shape, -1)
-    cols = _dofs(np.concatenate([slave.cell_nodes[facet], die.nodes[e]], axis=1))
-    points = dict(
-        facet=facet, die=e, cols=cols, xi=xi, weight=measure * jacobian, gap=gap, G=flat[0], slope=slope,
-        past=np.broadcast_to(outside, xi.shape),
+    def pointer(array: NDArray[Any]) -> Any:
+        return ffi.cast(POINTERS[array.dtype.char], array.ctypes.data)
+
+    into = slave._compiled[0], die._compiled[0], pointer(z), axis, sign, order, pointer(s), pointer(omega), axisymmetric
+    n = library.lib.ray_points(*into, pointer(vertex), ffi.NULL)
+    if n < 0:
+        raise ArithmeticError("the deformed die is no graph over the ray's base line")
+    L = 2 * (slave.cell_nodes.shape[1] + die.nodes.shape[1])
+    facet, on, cols = (np.empty(shape, dtype=np.int64) for shape in (n, n, (n, L)))
+    xi, weight, gap, slope, gap_xi = np.empty((5, n, order))
+    G, G_xi, a, b, dxi, dweight = np.empty((6, n, order, L))
+    past = np.empty((n, order), dtype=np.bool_)
+    out = ffi.new("points *")
+    (
+        out.facet, out.die, out.cols, out.xi, out.weight, out.gap, out.slope, out.gap_xi, out.past,
+        out.G, out.G_xi, out.left, out.right, out.dxi, out.dweight,
+    ) = map(pointer, (facet, on, cols, xi, weight, gap, slope, gap_xi, past, G, G_xi, a, b, dxi, dweight))  # fmt: skip
+    library.lib.ray_points(*into, pointer(vertex), out)
+    return Points(
+        facet, on, cols, xi, weight, gap, G, slope, past, gap_xi, G_xi, ((a, b), (b, a)), dxi, dweight
     )  # fmt: skip
-    if not variation:
-        return Points(**points)
 
-    # 4. second variation at fixed xi; there b is half of kappa a more, so that l (x) r = a (x) b + b (x) a
-    _, G_xi, a, b, dxi, dweight = rows
-    kappa = np.where(outside, 0.0, (ddx_d[..., c] - slope * ddx_d[..., p]) / dx_d[..., p] ** 2)
-    turning = np.where(outside[..., None], 0.0, dM / dx_d[..., p, None])
-    G_xi[..., c] = sign * np.concatenate([-dN, dx_s[..., p, None] * turning], axis=2)
-    G_xi[..., p] = -s_ * G_xi[..., c] - (sign * dx_s[..., p] * kappa)[..., None] * both
-    gap_xi = sign * (slope * dx_s[..., p] - dx_s[..., c])
-    a[..., p] = -both
-    b[..., n_cell:, c] = sign * turning
-    b[..., p] = (-0.5 * sign * kappa)[..., None] * both
-    b[..., n_cell:, p] -= s_ * b[..., n_cell:, c]
 
-    # 5. variation of the split points, and of the points and weights they carry
-    cut = np.zeros((2, len(facet), both.shape[2]))  # of the pieces' beginnings and ends
-    at = polynomial(xi_cut, cut_s)
-    speed = at[:, 2 + p, None]
-    for moved, piece in zip(cut, (begin, begin - 1), strict=True):
-        moved[piece, :n_cell] = at[:, 4 : 4 + n_cell] / -speed
-        moved[piece, n_cell + (vertex > e[piece])] = 1 / speed[:, 0]
-    wider = (cut[1] - cut[0])[:, None]
-    dxi[..., p] = cut[0][:, None] + s[:, None] * wider
-    dweight[..., p] = (omega * jacobian)[..., None] * wider
-    if axisymmetric:
-        dweight[..., p] += (2 * np.pi * measure * t * length)[..., None] * dxi[..., p]
-    _, G_xi, a, b, dxi, dweight = flat
-    return Points(**points, gap_xi=gap_xi, G_xi=G_xi, curvature=((a, b), (b, a)), dxi=dxi, dweight=dweight)
+POINTERS = {"d": "double *", "l": "int64_t *", "?": "int8_t *"}
+"""C's pointers to NumPy's types."""
 
 
 def least_gap(slave: Surface, die: Surface, z: Array, axis: int, sign: float) -> float:
@@ -348,8 +289,9 @@ def stress_rows(
     lmbda: float,
     mu: float,
     axisymmetric: bool = True,
-    variation: bool = False,
-) -> tuple[Array, Array | None]:
+    derivative: int = 0,
+    between: int = 0,
+) -> Array:
     """Component ``direction . sigma(u) N`` of the slave's traction, as rows over its cell's displacements.
 
     Args:
@@ -360,41 +302,26 @@ def stress_rows(
         lmbda: First Lamé parameter of the slave body, MPa; not used where the surface has pressures, ``mu p`` each.
         mu: Its shear modulus, MPa.
         axisymmetric: Add the hoop strain.
-        variation: Return the derivative with respect to xi too (at a fixed direction).
+        derivative: 1 for the rows' derivative with respect to xi (at a fixed direction).
+        between: Columns of zeros behind those of the displacements.
 
     Returns:
-        Rows ``shape=(n, q, 2 K)`` in MPa/mm (and 3 more, over the pressures, if the surface has them), and their
-        derivative or None.
+        Rows ``shape=(n, q, 2 K + between)`` in MPa/mm (and 3 more, over the pressures, if the surface has them).
     """
     mixed, K = slave.pressure_cols is not None, slave.cell_nodes.shape[1]
-    N = slave.normal[facet][:, None]
-    d = np.broadcast_to(direction, np.broadcast_shapes(np.shape(direction), N.shape))
-    along_N = np.einsum("nqi,nqi->nq", d, np.broadcast_to(N, d.shape))[..., None]
-    # what the gradient gives, by powers of xi
-    g = slave.gradients[facet][:, None]
-    along_d = np.einsum("nqjki,nqi->nqjk", np.broadcast_to(g, (*d.shape[:2], *g.shape[2:])), d)
-    along_n = np.einsum("nqjki,nqi->nqjk", g, N)
-    S = mu * (along_d[..., None] * N[:, :, None, None] + along_n[..., None] * d[:, :, None, None])
-    if not mixed:
-        S += lmbda * along_N[..., None, None] * g
-    S = S.reshape(*S.shape[:3], -1)
-    rows = np.zeros((1 + variation, *xi.shape, 2 * K + 3 * mixed))
-    rows[0, ..., : 2 * K] = polynomial(xi, S)
-    if variation and S.shape[2] == 2:
-        rows[1, ..., : 2 * K] = S[:, :, 1]
-    # what the pressure gives, or the hoop strain
-    if mixed:
-        ends = np.eye(3)[slave.facet_vertices[facet]]
-        for derivative in range(1 + variation):
-            rows[derivative, ..., 2 * K :] = -mu * along_N * (shape(xi, 2, derivative) @ ends)
-    elif axisymmetric:
-        start, t = slave.X[facet, 0, :1], (slave.X[:, 1, :1] - slave.X[:, 0, :1])[facet]
-        r = (start + xi * t)[..., None]
-        phi, phi_xi = np.split(polynomial(xi, slave.trace[facet][:, None]) * (lmbda * along_N / r), 2, axis=2)
-        rows[0, ..., : 2 * K : 2] += phi
-        if variation:
-            rows[1, ..., : 2 * K : 2] += phi_xi - phi * (t[:, None] / r)
-    return rows[0], rows[1] if variation else None
+    library, (n, q) = ray(), xi.shape
+    cast = library.ffi.cast
+    facet, xi = np.ascontiguousarray(facet, dtype=np.int64), np.ascontiguousarray(xi)
+    d = np.broadcast_to(np.asarray(direction, dtype=np.float64), (n, q, 2))
+    if d.strides[2] != d.itemsize:
+        d = np.ascontiguousarray(d)
+    rows = np.zeros((n, q, 2 * K + between + 3 * mixed))
+    library.lib.stress_rows(
+        slave._compiled[0], n, q, cast("int64_t *", facet.ctypes.data), cast("double *", xi.ctypes.data),
+        cast("double *", d.ctypes.data), d.strides[0] // d.itemsize, d.strides[1] // d.itemsize, lmbda, mu,
+        axisymmetric, derivative, rows.shape[2], 2 * K + between if mixed else -1, cast("double *", rows.ctypes.data),
+    )  # fmt: skip
+    return rows
 
 
 KEPT = 0.02

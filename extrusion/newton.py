@@ -59,6 +59,7 @@ class Newton:
         self._f = problem.x.duplicate()
         self._trial = problem.x.duplicate()
         self._trial_f = problem.x.duplicate()
+        self._step = problem.x.duplicate()
         self.A = problem.tangent_without_contact()
         snes = PETSc.SNES().create(problem.comm)
         snes.setOptionsPrefix("extrusion_")
@@ -161,20 +162,20 @@ class Newton:
         """
         if not self.predicts or not self.problem.expect(ahead):
             return 0
-        y, ksp = self._trial, self.snes.getKSP()
-        self.problem.residual(x, self._trial_f)
-        before = float(self._trial_f.norm())
+        y, trial, f, ksp = self._step, self._trial, self._trial_f, self.snes.getKSP()
+        self.problem.residual(x, f)
+        before = float(f.norm())
         if not np.isfinite(before):
             self.problem.expect(None)
             return 0
         A = self.problem.tangent(x, False)
         ksp.setOperators(A)
-        ksp.solve(self._trial_f, y)
+        ksp.solve(f, y)
         self.problem.expect(None)
-        moved = self.problem.largest_displacement(y)
-        y.aypx(-1.0, x)
-        self.problem.residual(y, self._trial_f)
-        if float(self._trial_f.norm()) < 3 * max(before, self.tolerance):  # the norm says little
-            y.copy(x)
-            self._update = moved / 4  # with the contact set known it is nearer than its size says
+        trial.waxpy(-1.0, y, x)
+        self.problem.residual(trial, f)
+        if float(f.norm()) < 3 * max(before, self.tolerance):  # the norm says little
+            trial.copy(x)
+            # with the contact set known it is nearer than its size says
+            self._update = self.problem.largest_displacement(y) / 4
         return 1

@@ -257,25 +257,21 @@ class CurvePair(Pair):
         direction: Array = self.direction
         if self.ray:
             of = slave, self.die, _even(z), self.axis, self.sign, order, self.axisymmetric
-            points = ray_points(*of, variation)
+            points = ray_points(*of)
         else:
             points, direction = self._closest_integration_points(z, order)
         if material is None:
             return points, None, None
-        S, S_xi = stress_rows(
-            slave, points.facet, points.xi, direction, material.lmbda, material.mu,
-            self.axisymmetric, variation and self.ray,
-        )  # fmt: skip
-        # S stands over the cell's displacements, then (mixed form) its pressures; the points over cell and die
-        n_u, n_points = 2 * slave.cell_nodes.shape[1], points.G.shape[2]
-
-        def over_all(rows: Array) -> Array:
-            between = np.zeros((*rows.shape[:2], n_points - n_u))
-            return np.concatenate([rows[..., :n_u], between, rows[..., n_u:]], axis=2)
-
         if slave.pressure_cols is not None:
             points = widened(points, slave.pressure_cols[points.facet])
-        return points, over_all(S), None if S_xi is None else over_all(S_xi)
+        # S stands over the cell's displacements, then (mixed form) its pressures; the points over cell and die too
+        n_die = 2 * self.die.nodes.shape[1]
+
+        def rows(derivative: int) -> Array:
+            of = slave, points.facet, points.xi, direction, material.lmbda, material.mu
+            return stress_rows(*of, self.axisymmetric, derivative, n_die)
+
+        return points, rows(0), rows(1) if variation and self.ray else None
 
     def _closest_integration_points(self, z: Array, order: int) -> tuple[Points, Array]:
         slave = self.slave
@@ -304,7 +300,7 @@ class CurvePair(Pair):
         facet = np.arange(len(slave.nodes))
         at = np.broadcast_to(xi, (len(facet), order))
         normal = slave.normal[:, None]
-        S, _ = stress_rows(slave, facet, at, normal, material.lmbda, material.mu, self.axisymmetric)
+        S = stress_rows(slave, facet, at, normal, material.lmbda, material.mu, self.axisymmetric)
         G = np.zeros_like(S)
         N = shape(at, slave.nodes.shape[1])
         for component in (0, 1):

@@ -1,0 +1,48 @@
+"""The contact points of curves in C, compiled when first used, and kept, as DOLFINx compiles and keeps its forms."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import sysconfig
+import tempfile
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from types import ModuleType
+
+from mpi4py import MPI  # noqa: F401  the wheel's DOLFINx needs the MPI that it loads
+
+import cffi
+
+from dolfinx.jit import get_options
+
+
+@cache
+def ray() -> ModuleType:
+    """``ray.c`` as a module of cffi (``ray().lib``, ``ray().ffi``), from DOLFINx's cache of compiled forms.
+
+    Ranks that find nothing there compile each for itself, and one of the results stays.
+    """
+    header, source = (resources.files("extrusion").joinpath(f"ray.{kind}").read_text("utf-8") for kind in "hc")
+    options = get_options()
+    arguments = [*options["cffi_extra_compile_args"], "-std=c17", "-O3"]
+    suffix = sysconfig.get_config_var("EXT_SUFFIX")
+    key = repr((header, source, arguments, cffi.__version__, suffix))
+    name = f"extrusion_ray_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+    folder = Path(options["cache_dir"])
+    library = folder / f"{name}{suffix}"
+    if not library.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        ffi = cffi.FFI()
+        ffi.cdef(header)
+        ffi.set_source(name, f"#include <stdint.h>\n{header}{source}", extra_compile_args=arguments)
+        with tempfile.TemporaryDirectory(dir=folder) as there:
+            os.replace(ffi.compile(tmpdir=there), library)
+    spec = importlib.util.spec_from_file_location(name, library)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
