@@ -623,7 +623,8 @@ class _Tangent:
             acts[D.rows[~own]] = True
             acts[n_f + D.cols[~own & (D.cols >= system.n_read)] - system.n_read] = True
             acts |= self._diagonal == 0.0
-            involved = np.flatnonzero(acts[:n_f] | (f != 0.0))
+            acts[:n_f] |= f != 0.0  # what has just been let go, too, displaces what is read
+            involved = np.flatnonzero(acts[:n_f])
         system.provide(involved)
         if D is None:
             return

@@ -20,7 +20,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.spatial
 
 from extrusion.gap import Array, Index, Points, closest_points, gauss, invert
 
@@ -636,7 +635,9 @@ def _near(die: Facets, xd: Array, x: Array, across: Array | None = None) -> Inde
     if across is not None:
         middle, x = middle[:, across], x[:, across]
     c = min(CANDIDATES, len(middle))
-    return np.asarray(scipy.spatial.cKDTree(middle).query(x, k=c)[1], dtype=np.int64).reshape(len(x), c)
+    from scipy.spatial import cKDTree  # a tenth of a second, which a scene in the plane does not need
+
+    return np.asarray(cKDTree(middle).query(x, k=c)[1], dtype=np.int64).reshape(len(x), c)
 
 
 def _seek(die: Facets, z: Array, x: Array, N: Array, keep: Index | None = None) -> tuple[Index, _Met, np.ndarray]:

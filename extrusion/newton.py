@@ -14,6 +14,9 @@ from extrusion.system import System
 REASONS = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 
 
+FACTORS = (1.0, 0.5, 0.25, 0.1, 0.04)
+"""Parts of a Newton update that are tried. The last two are for the billet's edge on the cone, on fine meshes."""
+
 ROUGHLY = 1e-4
 """Part of the first residual at which a solve of few iterations may end."""
 
@@ -31,7 +34,7 @@ class Outcome:
 class Newton:
     """SNES on the unknowns of a system.
 
-    Each step is the best of 1, 1/2, 1/4 of the Newton update in the residual's norm. The tangent takes the second
+    Each step is a part of the Newton update that lowers the residual's norm (`FACTORS`). The tangent takes the second
     variation of the gap (rotation of the die's facets, moving split points) once updates are small: it is indefinite
     at the die's corners, and from far away it misleads (CONTACT section 2).
 
@@ -97,18 +100,19 @@ class Newton:
             self.problem.residual(x, f)
 
     def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Scale the update y to the best of 1, 1/2, 1/4; SNES then takes x - y whole."""
+        """Scale the update y to the first of `FACTORS` that lowers the residual, or else to the best.
+
+        SNES then takes x - y whole.
+        """
         before = self.history[-1]
         best, norm = 0.0, np.inf
-        for factor in (1.0, 0.5, 0.25, 0.1, 0.02):  # the last two only where all before had no residual
+        for factor in FACTORS:
             self._trial.waxpy(-factor, y, x)
             self.problem.residual(self._trial, self._trial_f)
             found = float(self._trial_f.norm())
             if found < norm:
                 best, norm = factor, found
             if found < before:
-                break
-            if factor <= 0.25 and np.isfinite(norm):
                 break
         if best == 0.0:
             y.set(np.nan)

@@ -174,7 +174,10 @@ class SurfacePair(Pair):
         )
 
     def along(self, z: Array, points: Points) -> Array | None:
-        return None
+        assert isinstance(points, SurfacePoints)
+        assert points.t is not None
+        N = shape2(self.slave.nodes.shape[1], points.xi, points.t)
+        return self._base(N @ self.slave.position(z)[points.facet])
 
     # -- facets ----------------------------------------------------------------------------------------------
 
@@ -203,7 +206,13 @@ class SurfacePair(Pair):
         return out
 
     def along_corners(self, z: Array) -> Array | None:
-        return None
+        x = self.slave.position(z)[:, :4].reshape(-1, 3)
+        first = np.unique(self.corners.ravel(), return_index=True)[1]
+        return self._base(x[first])
+
+    def _base(self, x: Array) -> Array:
+        """The coordinate that the ray does not run along."""
+        return np.asarray(x[..., 1] if self.axis == 0 else np.linalg.norm(x[..., [0, 2]], axis=-1))
 
     def least_gap(self, z: Array) -> float:
         x = self._distance(self.slave.position(z))
