@@ -17,6 +17,12 @@ REASONS = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items
 FACTORS = (1.0, 0.5, 0.25, 0.1, 0.04)
 """Parts of a Newton update that are tried. The last two are for the billet's edge on the cone, on fine meshes."""
 
+WATCH = 6
+"""Steps in which the residual has to halve, lest it go round in a circle: else a whole one follows, whatever it brings.
+
+The watchdog of Chamberlain, Powell, Lemaréchal, Pedersen, Math. Prog. Study 16 (1982) 1, doi:10.1007/BFb0120945.
+"""
+
 ROUGHLY = 1e-4
 """Part of the first residual at which a solve of few iterations may end."""
 
@@ -58,7 +64,7 @@ class Newton:
         self._max = max_iterations
         facet = min((float(np.median(term.pair.slave.length)) for term in problem.terms), default=np.inf)
         self._near = min(0.02 * problem.case.profile.radius, 0.5 * facet) if near is None else near
-        self._update, self._fresh, self._holds = np.inf, False, False
+        self._update, self._fresh, self._holds, self._watched = np.inf, False, False, 0
         self._f = problem.x.duplicate()
         self._trial = problem.x.duplicate()
         self._trial_f = problem.x.duplicate()
@@ -105,6 +111,8 @@ class Newton:
         SNES then takes x - y whole.
         """
         before = self.history[-1]
+        if len(self.history) > self._watched + WATCH and before > 0.5 * self.history[-1 - WATCH]:
+            before, self._watched = np.inf, len(self.history)
         best, norm = 0.0, np.inf
         for factor in FACTORS:
             self._trial.waxpy(-factor, y, x)
@@ -146,7 +154,7 @@ class Newton:
             ahead: The increment over the last one.
         """
         self._limit = self._max if at_most is None else at_most
-        self.history, self._update, self._fresh, self._holds = [], np.inf, False, False
+        self.history, self._update, self._fresh, self._holds, self._watched = [], np.inf, False, False, 0
         self.problem.hold(None)
         self.tolerance = max(self.atol, self.problem.round_off(x))
         self.problem.set_accuracy(self.snes.getKSP(), self.tolerance)

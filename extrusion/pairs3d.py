@@ -206,9 +206,10 @@ class SurfacePair(Pair):
         return out
 
     def along_corners(self, z: Array) -> Array | None:
-        x = self.slave.position(z)[:, :4].reshape(-1, 3)
-        first = np.unique(self.corners.ravel(), return_index=True)[1]
-        return self._base(x[first])
+        slave = self.slave
+        x = np.empty((int(slave.nodes.max()) + 1, 3))
+        x[slave.nodes] = slave.position(z)
+        return self._base(x[np.unique(slave.vertices)])
 
     def _base(self, x: Array) -> Array:
         """The coordinate that the ray does not run along."""

@@ -15,11 +15,12 @@ from numpy.testing import assert_allclose
 from scenes import FRONT, SIDE, billet_mesh, block, solve, straight_die
 
 from extrusion.cases import A, Case
+from extrusion.condensed import Condensed
 from extrusion.contact import stiffness
 from extrusion.elasticity import Elastic
 from extrusion.errors import InputError, StepError
 from extrusion.mesh import PlainMesh, case_mesh
-from extrusion.newton import Newton, Outcome
+from extrusion.newton import WATCH, Newton, Outcome
 from extrusion.problem import Problem
 from extrusion.stepping import Step, steps
 from extrusion.zones import ContactState
@@ -352,6 +353,15 @@ def test_an_increment_that_fails_is_cut_and_recovers(law: str) -> None:
     assert cut.iterations > 4 * 3 + 4  # failed ones are counted
     assert_allclose(whole.points["K"], expected.points["K"], atol=1e-8)
     assert whole.energy == pytest.approx(expected.energy, rel=1e-8)
+
+
+def test_a_residual_that_goes_round_is_left() -> None:
+    """By linear triangles and the symmetric method, in the cone's apex at t = 155: by falling steps alone it circles."""
+    case = replace(A, die="rigid", order=1, size=4.0, method="nitsche", theta=1, gamma=10.0)
+    system = Condensed(Problem(case, case_mesh(A.profile, 4.0), MPI.COMM_SELF))
+    *_, last = steps(system, Newton(system), list(np.arange(5.0, 156.0, 5.0)))
+    assert last.cuts == 0
+    assert WATCH < last.iterations < 20
 
 
 def test_a_step_that_cannot_be_solved_says_where() -> None:

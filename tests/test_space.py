@@ -346,6 +346,39 @@ TAPER = straight_die(radius=10, length=20, bore=(10, 9), stop=50)
 TAPERED = replace(A, profile=TAPER, order=2, die="rigid", zones=(replace(GLIDING, initial="interpenetrating"),))
 
 
+# -- prediction ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", ["mortar", "nitsche 0"])
+def test_places_along_the_die(law: str) -> None:
+    """A contact set's edges stand at a y on the side and at a distance from the axis on the front."""
+    terms, z, _ = scene(built(law, "unilateral", "ray", "hex27", "elastic", "billet"), 143.0)
+    for term in terms:
+        pair = term.pair
+        order = np.argsort(pair.nodes)
+        of_vertex = order[np.searchsorted(pair.nodes, pair.slave.vertices, sorter=order)]
+        X = (pair.X + pair.displacement(z, pair.nodes))[of_vertex]
+        at = X[..., 1] if pair.axis == 0 else np.hypot(X[..., 0], X[..., 2])
+        corners = pair.along_corners(z)
+        assert corners is not None
+        assert_allclose(corners[pair.corners], at, atol=1e-12)
+        points = pair.points(z, 4, True)[0]
+        x = pair.report(z, points, np.zeros_like(points.gap), points.gap < 0).x
+        at = x[:, 1] if pair.axis == 0 else np.hypot(x[:, 0], x[:, 2])
+        assert_allclose(np.ravel(pair.along(z, points)), at, atol=1e-12)
+
+
+@pytest.mark.parametrize("law", ["mortar", "nitsche 0"])
+def test_prediction_saves_iterations(law: str) -> None:
+    """As in the plane: edges that move on in the die as they did are not found facet by facet."""
+    system = Condensed(in_space(**LAWS[law], die="rigid", order=2, size=6.0))
+    times = list(np.arange(5.0, 81.0, 5.0))
+    with_, without = (
+        sum(s.iterations for s in steps(system, Newton(system, predicts=p), times)) for p in (True, False)
+    )
+    assert with_ < 0.9 * without
+
+
 @pytest.mark.parametrize("law", ["nodal", "mortar", "nitsche 0"])
 def test_a_taper_as_in_axisymmetry(law: str) -> None:
     """A billet held to an inclined line, pushed by 10 of 50 mm: K, reaction and energy of triangles in the half-plane.
