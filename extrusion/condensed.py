@@ -91,14 +91,14 @@ def choose(problem: Problem, solver: str = "auto") -> System:
 
 
 def surface_memory(problem: Problem) -> float:
-    """Bytes of the compliance with all of its columns, body by body."""
+    """Bytes of the compliance with all of its columns, body by body, and of what of it is kept in single precision."""
     full = np.zeros(problem.n_z, dtype=bool)
     full[np.concatenate([term.forced for term in problem.terms])] = True
     n_u = problem.dim * len(problem.z_in_billet)
     in_billet = np.ones(problem.n_z, dtype=bool)
     in_billet[:n_u] = np.repeat(problem.z_in_billet, problem.dim)
     free = problem.z_free & (np.arange(problem.n_z) < problem.n_z - problem.n_multipliers)
-    return 8.0 * sum(int((full & free & body).sum()) * int((free & body).sum()) for body in (in_billet, ~in_billet))
+    return 12.0 * sum(int((full & free & body).sum()) * int((free & body).sum()) for body in (in_billet, ~in_billet))
 
 
 ITERATIVE_RATE = 6e-5
@@ -124,8 +124,8 @@ class Cost:
         """From entries of the bulk's factors times right-hand sides, the flops these took, and the surface's size."""
         active = forces / 3  # some are never reached, and of two at a node one is kept
         return cls(
-            condensation=2.2e-10 * entries,
-            surface=(0.2 * active**3 / 2e10) + 8 * 8 * active * read / 8e9 + 1e-3,
+            condensation=1.3e-10 * entries,
+            surface=0.2 * active**3 / 6e10 + 1.1e-9 * active * read + 1e-3,
             full=4.3e-6 * dofs + 2 * flops / 5e9,
         )
 

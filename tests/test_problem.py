@@ -356,7 +356,7 @@ def test_an_increment_that_fails_is_cut_and_recovers(law: str) -> None:
 
 
 def test_a_residual_that_goes_round_is_left() -> None:
-    """By linear triangles and the symmetric method, in the cone's apex at t = 155: by falling steps alone it circles."""
+    """By linear triangles and the symmetric method, in the cone's apex at t = 155: falling steps alone circle."""
     case = replace(A, die="rigid", order=1, size=4.0, method="nitsche", theta=1, gamma=10.0)
     system = Condensed(Problem(case, case_mesh(A.profile, 4.0), MPI.COMM_SELF))
     *_, last = steps(system, Newton(system), list(np.arange(5.0, 156.0, 5.0)))
