@@ -73,6 +73,7 @@ def test_a_run_in_its_own_process() -> None:
     assert min(seconds) > 0
     assert sum(seconds) < 10
     assert outcome.base <= outcome.memory_factor <= outcome.memory < 1000
+    assert 0.1 < outcome.compliance < 2  # MB
     full = bench.measure(replace(CELL, solver="full", until=20.0))
     assert (full.condensation, full.compliance) == (0.0, 0.0)
     assert math.isnan(full.pressure_error)
