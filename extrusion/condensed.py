@@ -797,7 +797,7 @@ class _Tangent:
         left = F - self._image(x) if x.any() else F.copy()
         norm = float(np.linalg.norm(F))
         tolerance = norm * min(max(self._rtol, 0.1 * (norm / self._last_norm) ** 2), self._most)
-        self._last_norm = norm
+        self._last_norm = norm or np.inf
         turn = 0
         while np.linalg.norm(left[self._entries]) > tolerance:
             if turn == 1 and not self._fresh:

@@ -75,6 +75,10 @@ class Surface:
         return np.einsum("ak,imkl,mij->malj", SHAPES[k][:-1, 0], table, K)
 
     @cached_property
+    def _last_node(self) -> int:
+        return int(max(self.nodes.max(), self.cell_nodes.max()))
+
+    @cached_property
     def _compiled(self) -> tuple[Any, list[Any]]:
         """The ``surface`` of ``ray.h``, and what it points to."""
         ffi = ray().ffi
@@ -235,7 +239,9 @@ def ray_points(
     library = ray()
     ffi, vertex = library.ffi, np.empty(len(die.X) + 1)
     s, omega = gauss(order)
-    z = np.ascontiguousarray(z)
+    z = np.ascontiguousarray(z, dtype=np.float64)
+    if len(z) < 2 * max(slave._last_node, die._last_node) + 2:
+        raise IndexError(f"z holds {len(z)} entries, the surfaces' nodes go to {max(slave._last_node, die._last_node)}")
 
     def pointer(array: NDArray[Any]) -> Any:
         return ffi.cast(POINTERS[array.dtype.char], array.ctypes.data)
@@ -255,9 +261,7 @@ def ray_points(
         out.G, out.G_xi, out.left, out.right, out.dxi, out.dweight,
     ) = map(pointer, (facet, on, cols, xi, weight, gap, slope, gap_xi, past, G, G_xi, a, b, dxi, dweight))  # fmt: skip
     library.lib.ray_points(*into, pointer(vertex), out)
-    return Points(
-        facet, on, cols, xi, weight, gap, G, slope, past, gap_xi, G_xi, ((a, b), (b, a)), dxi, dweight
-    )  # fmt: skip
+    return Points(facet, on, cols, xi, weight, gap, G, slope, past, gap_xi, G_xi, ((a, b), (b, a)), dxi, dweight)
 
 
 POINTERS = {"d": "double *", "l": "int64_t *", "?": "int8_t *"}
@@ -311,6 +315,7 @@ def stress_rows(
     mixed, K = slave.pressure_cols is not None, slave.cell_nodes.shape[1]
     library, (n, q) = ray(), xi.shape
     cast = library.ffi.cast
+    assert slave.tabulate is not None
     facet, xi = np.ascontiguousarray(facet, dtype=np.int64), np.ascontiguousarray(xi)
     d = np.broadcast_to(np.asarray(direction, dtype=np.float64), (n, q, 2))
     if d.strides[2] != d.itemsize:

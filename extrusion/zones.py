@@ -109,7 +109,7 @@ class Expected:
     """The contact set that an increment is expected to end with: the accepted one, its edges moved on as they did last.
 
     Where an edge is new the accepted set only keeps closed what it holds; where all are known it also keeps the rest
-    open (`known`).
+    open.
     """
 
     def __init__(self) -> None:
