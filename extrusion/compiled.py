@@ -18,12 +18,17 @@ import cffi
 
 from dolfinx.jit import get_options
 
+from extrusion.errors import InputError
+
 
 @cache
 def ray() -> ModuleType:
     """``ray.c`` as a module of cffi (``ray().lib``, ``ray().ffi``), from DOLFINx's cache of compiled forms.
 
-    Ranks that find nothing there compile each for itself, and one of the results stays.
+    Processes that find nothing there compile each for itself, and one of the results stays.
+
+    Raises:
+        InputError: There is no C compiler that works.
     """
     header, source = (resources.files("extrusion").joinpath(f"ray.{kind}").read_text("utf-8") for kind in "hc")
     options = get_options()
@@ -39,7 +44,14 @@ def ray() -> ModuleType:
         ffi.cdef(header)
         ffi.set_source(name, f"#include <stdint.h>\n{header}{source}", extra_compile_args=arguments)
         with tempfile.TemporaryDirectory(dir=folder) as there:
-            os.replace(ffi.compile(tmpdir=there), library)
+            try:
+                os.replace(ffi.compile(tmpdir=there), library)
+            except cffi.VerificationError as error:
+                reason = str(error).splitlines()[0]
+                remedy = (
+                    f"ray.c does not compile ({reason}): install a C compiler with Python's headers, or name it in CC"
+                )
+                raise InputError("CC", os.environ.get("CC", "cc"), remedy) from None
     spec = importlib.util.spec_from_file_location(name, library)
     assert spec is not None
     assert spec.loader is not None

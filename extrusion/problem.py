@@ -24,6 +24,7 @@ import ufl
 from dolfinx import fem
 
 from extrusion.cases import GAMMA, LOCKING_FROM, Case, Zone
+from extrusion.compiled import ray
 from extrusion.contact import REFERENCE_NU, stiffness
 from extrusion.elasticity import (
     epsilon,
@@ -99,6 +100,8 @@ class Problem(System):
         self._materials = {"billet": case.billet, "die": case.die_material}
         self._assemble_bulk()
         self._find_supports()
+        if self.dim == 2:
+            on_root(comm, ray)  # compiled there, if it has to be, before the other ranks look for it
         self._gather_contact()
         self._lay_out()
         self._krylov: Krylov | None = None

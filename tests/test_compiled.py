@@ -12,11 +12,11 @@ print(ray().lib.ray_points)
 """
 
 
-def started(cache: Path) -> subprocess.Popen[str]:
+def started(cache: Path, **changes: str) -> subprocess.Popen[str]:
     """A process that loads the library."""
     return subprocess.Popen(
         [sys.executable, "-c", SCRIPT],
-        env={**os.environ, "XDG_CACHE_HOME": str(cache)},
+        env={**os.environ, "XDG_CACHE_HOME": str(cache), **changes},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -36,3 +36,12 @@ def test_two_processes_leave_one_library(tmp_path: Path) -> None:
     assert process.returncode == 0, output
     assert library.stat().st_mtime_ns == made.st_mtime_ns
     assert library.stat().st_ino == made.st_ino
+
+
+def test_without_a_compiler(tmp_path: Path) -> None:
+    """One line that names it, and nothing left behind."""
+    process = started(tmp_path, CC="/no/such/cc")
+    output = process.communicate(timeout=120)[0]
+    assert process.returncode != 0
+    assert output.splitlines()[-1].startswith("extrusion.errors.InputError: CC = '/no/such/cc': ray.c does not compile")
+    assert not list((tmp_path / "fenics").iterdir())
