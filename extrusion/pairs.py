@@ -182,6 +182,15 @@ class Pair(ABC):
         """Of some nodes, ``shape=(*nodes.shape, dim)``, mm."""
         return np.asarray(z[self.dim * nodes[..., None] + np.arange(self.dim)])
 
+    def tested(self, points: Points) -> Index:
+        """Local columns of points that the gap depends on, the facet's nodes and the die's: ``shape=(n, L)``."""
+        slave, dim = self.slave, self.dim
+        nodes = dim * slave.local[points.facet][..., None] + np.arange(dim)
+        n_u = dim * slave.cell_nodes.shape[1]
+        die = np.arange(n_u, n_u + dim * self.die.nodes.shape[1] if len(self.die.nodes) else n_u)
+        n = len(points.facet)
+        return np.concatenate([nodes.reshape(n, nodes.shape[1] * dim), np.broadcast_to(die, (n, len(die)))], axis=1)
+
     def forced(self, behind: bool = False) -> Index:
         """Entries of z that forces at the slave's facets (or in the cells behind them) and at the die's go to."""
         if self.closure == "check":

@@ -232,7 +232,7 @@ class NodalContact:
             return _none(), self._kappa[:0]
         _, _, dsc = self._law(z)
         J = np.einsum("n,ni,nj->nij", dsc * self._kappa, self._G, self._G)
-        return _triplets(self._cols, J), self._kappa
+        return _triplets(self._cols, self._cols, J), self._kappa
 
     def accept(self, z: Array) -> None:
         if not self.multipliers:
@@ -403,8 +403,11 @@ class IntegratedContact:
             for a, b in points.curvature:
                 left.append(w_sc * a)
                 right.append(b)
-        J = np.swapaxes(np.concatenate(left, axis=1), 1, 2) @ np.concatenate(right, axis=1)
-        return _triplets(points.cols, J)
+        forces, rows = np.concatenate(left, axis=1), points.cols
+        if not theta:  # on the facet's nodes and the die's alone, not on the cell's others
+            tested = self.pair.tested(points)
+            forces, rows = np.take_along_axis(forces, tested[:, None], axis=2), np.take_along_axis(rows, tested, axis=1)
+        return _triplets(rows, points.cols, np.swapaxes(forces, 1, 2) @ np.concatenate(right, axis=1))
 
     def stiff(self, z: Array) -> tuple[Triplets, Array]:
         if self.pair.closure == "check" or self.pair.is_far(z, self._radius):
@@ -413,7 +416,8 @@ class IntegratedContact:
         _, _, dsc, k = self._law(z, points, S)
         on = (dsc > 0).any(axis=1)
         G, w = points.G[on], (points.weight * dsc * k)[on]
-        return _triplets(points.cols[on], np.swapaxes(w[..., None] * G, 1, 2) @ G), np.zeros(0)
+        cols = points.cols[on]
+        return _triplets(cols, cols, np.swapaxes(w[..., None] * G, 1, 2) @ G), np.zeros(0)
 
     def closed_edge(self) -> tuple[Triplets, Array]:
         """What the symmetric method (theta = 1) adds to the bulk with every facet closed against a plane die.
@@ -665,10 +669,13 @@ def _farthest(gap: Array, of: np.ndarray) -> float:
     return float(np.max(np.abs(gap[of]), initial=0.0))
 
 
-def _triplets(cols: Index, J: Array) -> Triplets:
-    """Blocks over some columns as (rows, columns, values)."""
-    rows = np.broadcast_to(cols[:, :, None], J.shape)
-    return rows.ravel(), np.broadcast_to(cols[:, None, :], J.shape).ravel(), J.ravel()
+def _triplets(rows: Index, cols: Index, J: Array) -> Triplets:
+    """Blocks over some rows and columns as (rows, columns, values)."""
+    return (
+        np.broadcast_to(rows[:, :, None], J.shape).ravel(),
+        np.broadcast_to(cols[:, None, :], J.shape).ravel(),
+        J.ravel(),
+    )
 
 
 def _none() -> Triplets:
