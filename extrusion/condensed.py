@@ -618,21 +618,25 @@ class _Tangent:
         if D is not None:
             self._diagonal = np.full(n_f + system.n_multipliers, -1.0)
             self._acts = acts = np.zeros(len(self._diagonal), dtype=bool)
-            own = (D.rows >= n_f) & (D.cols - system.n_read == D.rows - n_f)  # multipliers on their own rows
-            self._diagonal[n_f:] = np.bincount(D.rows[own] - n_f, D.values[own], system.n_multipliers)
-            acts[D.rows[~own]] = True
-            acts[n_f + D.cols[~own & (D.cols >= system.n_read)] - system.n_read] = True
-            acts |= self._diagonal == 0.0
+            if system.n_multipliers:
+                own = (D.rows >= n_f) & (D.cols - system.n_read == D.rows - n_f)  # multipliers on their own rows
+                self._diagonal[n_f:] = np.bincount(D.rows[own] - n_f, D.values[own], system.n_multipliers)
+                acts[D.rows[~own]] = True
+                acts[n_f + D.cols[~own & (D.cols >= system.n_read)] - system.n_read] = True
+                acts |= self._diagonal == 0.0
+            else:
+                acts[D.rows] = True
             acts[:n_f] |= f != 0.0  # what has just been let go, too, displaces what is read
             involved = np.flatnonzero(acts[:n_f])
         system.provide(involved)
         if D is None:
             return
         self._hold(D)
-        r, c = self._row[D.rows], self._col[D.cols]
-        on = np.flatnonzero((r >= 0) & (c >= 0))
-        values = D.values[on].astype(self._dtype)
-        self._D = scipy.sparse.coo_array((values, (r[on], c[on])), shape=(len(self._entries), len(self._cols))).tocsr()
+        r, c, values = self._row[D.rows], self._col[D.cols], D.values.astype(self._dtype)
+        if system.n_multipliers:  # those that are not pressed have no row
+            on = np.flatnonzero((r >= 0) & (c >= 0))
+            r, c, values = r[on], c[on], values[on]
+        self._D = scipy.sparse.coo_array((values, (r, c)), shape=(len(self._entries), len(self._cols))).tocsr()
         self._fresh = self._lu is None
         if self._lu is None:
             self._factor(self.PARALLEL)
