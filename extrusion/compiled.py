@@ -28,30 +28,30 @@ def ray() -> ModuleType:
     Processes that find nothing there compile each for itself, and one of the results stays.
 
     Raises:
-        InputError: There is no C compiler that works.
+        InputError: There is no C compiler that works, or the cache cannot be written.
     """
     header, source = (resources.files("extrusion").joinpath(f"ray.{kind}").read_text("utf-8") for kind in "hc")
     options = get_options()
-    arguments = [*options["cffi_extra_compile_args"], "-std=c17", "-O3"]
+    arguments = [*options["cffi_extra_compile_args"], "-std=c17", "-O3", "-fno-fast-math", "-ffp-contract=off"]
     suffix = sysconfig.get_config_var("EXT_SUFFIX")
     key = repr((header, source, arguments, cffi.__version__, suffix))
     name = f"extrusion_ray_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
     folder = Path(options["cache_dir"])
     library = folder / f"{name}{suffix}"
     if not library.exists():
-        folder.mkdir(parents=True, exist_ok=True)
         ffi = cffi.FFI()
         ffi.cdef(header)
         ffi.set_source(name, f"#include <stdint.h>\n{header}{source}", extra_compile_args=arguments)
-        with tempfile.TemporaryDirectory(dir=folder) as there:
-            try:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=folder) as there:
                 os.replace(ffi.compile(tmpdir=there), library)
-            except cffi.VerificationError as error:
-                reason = str(error).splitlines()[0]
-                remedy = (
-                    f"ray.c does not compile ({reason}): install a C compiler with Python's headers, or name it in CC"
-                )
-                raise InputError("CC", os.environ.get("CC", "cc"), remedy) from None
+        except OSError as error:
+            remedy = f"cannot be written ({error.strerror}): let XDG_CACHE_HOME name another folder"
+            raise InputError("cache_dir", str(folder), remedy) from None
+        except Exception as error:  # cffi's own, or setuptools'
+            remedy = f"ray.c does not compile ({str(error).splitlines()[0]}): install a C compiler and Python's headers"
+            raise InputError("CC", os.environ.get("CC", "cc"), remedy) from None
     spec = importlib.util.spec_from_file_location(name, library)
     assert spec is not None
     assert spec.loader is not None

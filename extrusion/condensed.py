@@ -20,6 +20,8 @@ import logging
 import os
 import time
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -91,14 +93,16 @@ def choose(problem: Problem, solver: str = "auto") -> System:
 
 
 def surface_memory(problem: Problem) -> float:
-    """Bytes of the compliance with all of its columns, body by body, and of what of it is kept in single precision."""
+    """Bytes of the compliance with all of its columns, body by body, and of its copy in single precision if any."""
     full = np.zeros(problem.n_z, dtype=bool)
     full[np.concatenate([term.forced for term in problem.terms])] = True
     n_u = problem.dim * len(problem.z_in_billet)
     in_billet = np.ones(problem.n_z, dtype=bool)
     in_billet[:n_u] = np.repeat(problem.z_in_billet, problem.dim)
     free = problem.z_free & (np.arange(problem.n_z) < problem.n_z - problem.n_multipliers)
-    return 12.0 * sum(int((full & free & body).sum()) * int((free & body).sum()) for body in (in_billet, ~in_billet))
+    sizes = [(int((full & free & body).sum()), int((free & body).sum())) for body in (in_billet, ~in_billet)]
+    each = 8.0 + np.dtype(_precision(problem.case.method, sum(n for n, _ in sizes))).itemsize % 8
+    return each * sum(n * m for n, m in sizes)
 
 
 ITERATIVE_RATE = 6e-5
@@ -175,8 +179,7 @@ class Condensed(System):
         z_of = np.concatenate([read, np.full(len(more), -1)])
         dofs = np.concatenate([dofs, more])
         # along the surface, so that what contact reads at one time stands together
-        along = np.append(self._along(), 0.0)[np.where(z_of < n_u, z_of // dim, -1)]
-        order = np.lexsort((along, ~bodies))
+        order = np.lexsort((np.append(self._along(), 0.0)[z_of], ~bodies))
         self.dofs, z_of, bodies = dofs[order], z_of[order], bodies[order]
         self.bodies = [slice(0, int(bodies.sum())), slice(int(bodies.sum()), len(bodies))]
         self.n_read = len(self.dofs)
@@ -208,14 +211,17 @@ class Condensed(System):
         self._z_start = np.where(full.z_to_x >= 0, full.start_at(full.z_to_x), 0.0)
 
     def _along(self) -> Array:
-        """Place of each node of z along the profile: y, less the distance from the axis. Collective."""
-        full = self.full
-        blocks, dim = len(full.z_in_billet), full.dim
+        """Place of each entry of z along the profile: y, less the distance from the axis. Collective."""
+        full, dim = self.full, self.full.dim
         X = full.V.tabulate_dof_coordinates()[: full.V.dofmap.index_map.size_local]
         place = full.x.duplicate()
-        place.array[: dim * len(X) : dim] = X[:, 1] - (X[:, 0] if dim == 2 else np.hypot(X[:, 0], X[:, 2]))
-        out = np.array(full.gather(place)[: dim * blocks : dim])
+        place.array[: dim * len(X)] = np.repeat(X[:, 1] - (X[:, 0] if dim == 2 else np.hypot(X[:, 0], X[:, 2])), dim)
+        out = np.array(full.gather(place)[: self.n_z - self.n_multipliers])
         place.destroy()
+        for term in self.terms:
+            slave = term.pair.slave
+            if slave.pressure_cols is not None:  # with their cells
+                out[slave.pressure_cols] = out[dim * slave.cell_nodes[:, :1]]
         return out
 
     # -- bulk ------------------------------------------------------------------------------------------------
@@ -307,7 +313,8 @@ class Condensed(System):
         self.set_solver(ksp)
         self._tangent.forget()
         ksp.setOperators(self.tangent(x, False))
-        ksp.solve(f, y)
+        with self._tangent.closely():  # no step of Newton's method mends what is left
+            ksp.solve(f, y)
         ksp.destroy()
         y.array[:1] = 0.0
         K = self.point_displacements(y, {"K": self._watch["K"]})["K"][1]
@@ -583,12 +590,9 @@ class _Tangent:
     STALE = 20
     """Krylov iterations after which a factorisation of an earlier tangent is made anew."""
 
-    MANY = 1200
-    """Forces from which on single precision pays."""
-
     def __init__(self, system: Condensed) -> None:
         self._system = weakref.proxy(system)  # PETSc holds this object in C
-        self._dtype: Any = np.float32 if system.n_forces > self.MANY and system.case.method != "nodal" else np.float64
+        self._dtype: Any = _precision(system.case.method, system.n_forces)
         # how closely systems are solved, in parts of the right-hand side: as closely as Newton's method converges
         # (Eisenstat, Walker, SIAM J. Sci. Comput. 17 (1996) 16, doi:10.1137/0917003), but always most closely for
         # passes, and for theta, whose forces on the billet's inside outweigh what the gap says
@@ -609,6 +613,15 @@ class _Tangent:
     def forget(self) -> None:
         """Factor the next tangent anew."""
         self._lu: Any = None
+
+    @contextmanager
+    def closely(self) -> Iterator[None]:
+        """Solve as closely as the precision allows."""
+        most, self._most = self._most, self._rtol
+        try:
+            yield
+        finally:
+            self._most = most
 
     def set(self, D: _Derivative | None, f: Array) -> None:
         """Take a derivative and the forces it belongs to (on rank 0). Collective."""
@@ -816,6 +829,15 @@ class _Tangent:
             turn += 1
         into[0] = b.array_r[0]
         into[1:] = x
+
+
+MANY = 1200
+"""Forces from which on single precision pays."""
+
+
+def _precision(method: str, forces: int) -> Any:
+    """Of the solves with the tangent."""
+    return np.float32 if forces > MANY and method != "nodal" else np.float64
 
 
 @cache

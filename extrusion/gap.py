@@ -234,7 +234,7 @@ def ray_points(
         axisymmetric: Weights ``2 pi r ds`` (else ds).
 
     Raises:
-        ArithmeticError: The deformed die is no graph over p (an iterate gone astray).
+        ArithmeticError: The deformed die is no graph over p, or the slave is nowhere (an iterate gone astray).
     """
     library = ray()
     ffi, vertex = library.ffi, np.empty(len(die.X) + 1)
@@ -260,7 +260,8 @@ def ray_points(
         out.facet, out.die, out.cols, out.xi, out.weight, out.gap, out.slope, out.gap_xi, out.past,
         out.G, out.G_xi, out.left, out.right, out.dxi, out.dweight,
     ) = map(pointer, (facet, on, cols, xi, weight, gap, slope, gap_xi, past, G, G_xi, a, b, dxi, dweight))  # fmt: skip
-    library.lib.ray_points(*into, pointer(vertex), out)
+    filled = library.lib.ray_points(*into, pointer(vertex), out)
+    assert filled == n
     return Points(facet, on, cols, xi, weight, gap, G, slope, past, gap_xi, G_xi, ((a, b), (b, a)), dxi, dweight)
 
 
@@ -315,7 +316,8 @@ def stress_rows(
     mixed, K = slave.pressure_cols is not None, slave.cell_nodes.shape[1]
     library, (n, q) = ray(), xi.shape
     cast = library.ffi.cast
-    assert slave.tabulate is not None
+    if slave.tabulate is None:
+        raise ValueError("the surface has no cells behind it")
     facet, xi = np.ascontiguousarray(facet, dtype=np.int64), np.ascontiguousarray(xi)
     d = np.broadcast_to(np.asarray(direction, dtype=np.float64), (n, q, 2))
     if d.strides[2] != d.itemsize:

@@ -167,7 +167,7 @@ class Newton:
     def _predict(self, x: PETSc.Vec, ahead: float) -> int:
         """One linear solve with the contact set that is expected: it hardly moves in the die as the billet slides by.
 
-        Newton's method would find the ends of the contact by steps of a few facets. Kept unless the residual grows.
+        Newton's method would find the ends of the contact by steps of a few facets. Kept unless the residual triples.
 
         Returns:
             How many linear solves it took.

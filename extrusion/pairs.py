@@ -133,8 +133,8 @@ class Pair(ABC):
         """Report at integration points; ``stress`` is that conjugate to the gap, MPa."""
 
     @abstractmethod
-    def along(self, z: Array, points: Points) -> Array | None:
-        """Positions of the points along the die, mm; None where a contact set has no order."""
+    def along(self, z: Array, points: Points) -> Array:
+        """Positions of the points along the die, by which a contact set is in order, mm."""
 
     # -- facets ----------------------------------------------------------------------------------------------
 
@@ -161,7 +161,7 @@ class Pair(ABC):
         """Integral of each vertex's linear function over the reference surface, mm^2 or mm."""
 
     @abstractmethod
-    def along_corners(self, z: Array) -> Array | None:
+    def along_corners(self, z: Array) -> Array:
         """Positions of the vertices along the die, mm."""
 
     # -- common ----------------------------------------------------------------------------------------------
@@ -339,7 +339,7 @@ class CurvePair(Pair):
             closed.ravel(),
         )
 
-    def along(self, z: Array, points: Points) -> Array | None:
+    def along(self, z: Array, points: Points) -> Array:
         slave, c = self.slave, 1 - self.axis
         nodal = slave.X[..., c] + z[2 * slave.nodes + c]
         return np.asarray(np.einsum("nqi,ni->nq", shape(points.xi, slave.nodes.shape[1]), nodal[points.facet]))
@@ -368,7 +368,7 @@ class CurvePair(Pair):
         np.add.at(out, self.corners, measure @ shape(xi, 2))
         return out
 
-    def along_corners(self, z: Array) -> Array | None:
+    def along_corners(self, z: Array) -> Array:
         slave, c = self.slave, 1 - self.axis
         at = slave.X[:, :2, c] + z[2 * slave.nodes[:, :2] + c]
         return np.append(at[:, 0], at[-1:, 1])

@@ -173,7 +173,7 @@ class SurfacePair(Pair):
             x, self.arc(X), points.gap.ravel(), normal.ravel(), ray.ravel(), weight.ravel(), closed.ravel()
         )
 
-    def along(self, z: Array, points: Points) -> Array | None:
+    def along(self, z: Array, points: Points) -> Array:
         assert isinstance(points, SurfacePoints)
         assert points.t is not None
         N = shape2(self.slave.nodes.shape[1], points.xi, points.t)
@@ -205,7 +205,7 @@ class SurfacePair(Pair):
         np.add.at(out, self.corners, (self._measure(s, t) * omega) @ shape2(4, s, t))
         return out
 
-    def along_corners(self, z: Array) -> Array | None:
+    def along_corners(self, z: Array) -> Array:
         slave = self.slave
         x = np.empty((int(slave.nodes.max()) + 1, 3))
         x[slave.nodes] = slave.position(z)

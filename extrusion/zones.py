@@ -71,25 +71,24 @@ class ContactSet:
     """The closed stretches of a zone, by where along the die they begin and end."""
 
     first: bool  # whether what lies before all edges is closed
-    edges: Array  # increasing, mm
+    edges: Array  # in order, mm
 
     @classmethod
-    def of(cls, at: Array | None, trial: Array, closed: np.ndarray) -> ContactSet | None:
+    def of(cls, at: Array, trial: Array, closed: np.ndarray) -> ContactSet | None:
         """From positions in any order, their trial stress and whether they are closed; None if none is.
 
         An edge stands where the trial stress, linear between the two points beside it, vanishes.
         """
-        if at is None or not np.any(closed):
+        if not np.any(closed):
             return None
-        order = np.argsort(at, axis=None)
+        order = np.argsort(at, axis=None, kind="stable")
         at, closed, size = (a.ravel()[order] for a in (at, closed, np.abs(trial)))
         i = np.flatnonzero(closed[1:] != closed[:-1])
         share = size[i] / np.maximum(size[i] + size[i + 1], np.finfo(float).tiny)
         return cls(bool(closed[0]), at[i] + share * (at[i + 1] - at[i]))
 
-    def __call__(self, at: Array | None) -> np.ndarray:
+    def __call__(self, at: Array) -> np.ndarray:
         """Whether positions are closed."""
-        assert at is not None
         return np.asarray((np.searchsorted(self.edges, at) % 2 == 1) != self.first)
 
     def partners(self, other: ContactSet) -> Array:
@@ -105,11 +104,15 @@ class ContactSet:
         return out
 
 
+MOST_AHEAD = 4.0
+"""How many times their last change edges are moved on at most."""
+
+
 class Expected:
     """The contact set that an increment is expected to end with: the accepted one, its edges moved on as they did last.
 
-    Where an edge is new the accepted set only keeps closed what it holds; where all are known it also keeps the rest
-    open.
+    Where an edge is new, or edges would pass each other, the accepted set only keeps closed what it holds; else the set
+    keeps the rest open, too.
     """
 
     def __init__(self) -> None:
@@ -131,9 +134,9 @@ class Expected:
         # the start has an edge at every other point that rests on the die
         if now is not None and before is not None and len(before.edges) <= len(now.edges) + 2:
             change = now.edges - before.partners(now)
-            self._known = not np.isnan(change).any()
-            edges = now.edges + (ahead or 0.0) * change
-            if self._known and np.all(np.diff(edges) > 0):
+            edges = now.edges + min(ahead or 0.0, MOST_AHEAD) * change
+            self._known = bool(np.all(np.diff(edges) >= 0)) and not np.isnan(edges).any()
+            if self._known:
                 now = ContactSet(now.first, edges)
         self._now = now
         return now is not None
@@ -143,7 +146,7 @@ class Expected:
         """Whether a set is expected."""
         return self._now is not None
 
-    def law(self, trial: Array, at: Array | None) -> tuple[Array, Array]:
+    def law(self, trial: Array, at: Array) -> tuple[Array, Array]:
         """As `extrusion.contact.project`, of points at these places along the die, with the set that is expected."""
         assert self._now is not None
         closed = self._now(at)
@@ -298,6 +301,7 @@ class IntegratedContact:
         self._held = None if z is None or self.pair.is_far(z, self._radius) else self.pair.facing(self._points(z)[0])
 
     def start(self, z: Array) -> None:
+        self._expected = Expected()
         points = self._points(z)[0]
         held = self.pair.touches(z, points, self._radius, self._interpenetrating)
         self.closed = self._whole_facets(points, held)
@@ -496,6 +500,7 @@ class MortarContact:
         self._held = None if z is None or self.pair.is_far(z, self._radius) else self.pair.facing(self._points(z))
 
     def start(self, z: Array) -> None:
+        self._expected = Expected()
         points = self._points(z)
         held = self.pair.touches(z, points, self._radius, self._interpenetrating)
         self.closed[:] = True

@@ -45,3 +45,12 @@ def test_without_a_compiler(tmp_path: Path) -> None:
     assert process.returncode != 0
     assert output.splitlines()[-1].startswith("extrusion.errors.InputError: CC = '/no/such/cc': ray.c does not compile")
     assert not list((tmp_path / "fenics").iterdir())
+
+
+def test_a_cache_that_cannot_be_written(tmp_path: Path) -> None:
+    """One line that names the folder."""
+    (tmp_path / "fenics").write_text("not a folder")
+    process = started(tmp_path)
+    output = process.communicate(timeout=120)[0]
+    assert process.returncode != 0
+    assert output.splitlines()[-1].startswith("extrusion.errors.InputError: cache_dir = ")

@@ -95,6 +95,14 @@ def test_choice(caplog: pytest.LogCaptureFixture) -> None:
         choose(problem, "fast")
 
 
+def test_a_second_run_is_the_first() -> None:
+    """Nothing is expected from the contact set that another run has ended with."""
+    system = Condensed(scene(UNILATERAL))
+    times = [5.0, 10.0, 20.0, 30.0]
+    first, second = ([s.iterations for s in steps(system, Newton(system), times)] for _ in range(2))
+    assert first == second
+
+
 def test_prediction_saves_iterations() -> None:
     """A fifth and more: the ends of the contact, which go on in the die as they did, are not found facet by facet."""
     system = Condensed(scene(replace(UNILATERAL, size=2.0)))

@@ -45,6 +45,18 @@ def test_die_effect_is_what_an_elastic_die_changes(contact: str) -> None:
     assert 0.8 < ratio < 2  # first order, on a coarse mesh
 
 
+def test_die_effect_is_solved_closely() -> None:
+    """It is one linear solve, that no step of Newton's method mends: it is asked twice, after looser ones."""
+    case = replace(UNTIL_50, size=8.0)
+    stiff = Condensed(Problem(case, case_mesh(case.profile, case.mesh_size), SELF), stiff_die=True)
+    tangent = stiff._tangent
+    for _ in steps(stiff, Newton(stiff), case.times()):
+        tangent._last_norm = 1e-9  # as a converged solve leaves it
+        effect = stiff.die_effect(stiff.x)
+        tangent._last_norm = np.inf
+        np.testing.assert_allclose(effect, stiff.die_effect(stiff.x), rtol=1e-7, atol=1e-9)
+
+
 def test_a_stiff_die_is_a_rigid_one() -> None:
     """A die that gives way a little; the two differ by where coarse facets are split alone."""
     tracks = []

@@ -360,7 +360,6 @@ def test_places_along_the_die(law: str) -> None:
         X = (pair.X + pair.displacement(z, pair.nodes))[of_vertex]
         at = X[..., 1] if pair.axis == 0 else np.hypot(X[..., 0], X[..., 2])
         corners = pair.along_corners(z)
-        assert corners is not None
         assert_allclose(corners[pair.corners], at, atol=1e-12)
         points = pair.points(z, 4, True)[0]
         x = pair.report(z, points, np.zeros_like(points.gap), points.gap < 0).x

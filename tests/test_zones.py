@@ -319,7 +319,6 @@ def test_contact_set_finds_its_edges_between_points() -> None:
     assert_allclose(found.edges, [2 / 3, 2.25])
     assert_array_equal(found(np.array([0.0, 1.0, 2.0, 2.5])), [False, True, True, False])
     assert ContactSet.of(at, trial, trial > 9) is None
-    assert ContactSet.of(None, trial, trial < 0) is None
 
 
 def test_edges_of_two_sets_pair_with_the_nearest_of_their_kind() -> None:
