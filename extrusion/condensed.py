@@ -101,8 +101,8 @@ def surface_memory(problem: Problem) -> float:
     in_billet[:n_u] = np.repeat(problem.z_in_billet, problem.dim)
     free = problem.z_free & (np.arange(problem.n_z) < problem.n_z - problem.n_multipliers)
     sizes = [(int((full & free & body).sum()), int((free & body).sum())) for body in (in_billet, ~in_billet)]
-    each = 8.0 + np.dtype(_precision(problem.case.method, sum(n for n, _ in sizes))).itemsize % 8
-    return each * sum(n * m for n, m in sizes)
+    copied = _precision(problem.case.method, sum(n for n, _ in sizes)) == np.float32
+    return (12.0 if copied else 8.0) * sum(n * m for n, m in sizes)
 
 
 ITERATIVE_RATE = 6e-5

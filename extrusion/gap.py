@@ -81,17 +81,15 @@ class Surface:
     @cached_property
     def _compiled(self) -> tuple[Any, list[Any]]:
         """The ``surface`` of ``ray.h``, and what it points to."""
-        ffi = ray().ffi
         (m, k), K = self.nodes.shape, self.cell_nodes.shape[1]
         arrays: dict[str, Any] = {"X": self.X, "normal": self.normal, "length": self.length}
         arrays |= {"nodes": self.nodes, "cells": self.cell_nodes, "local": self.local, "ends": self.facet_vertices}
         if self.tabulate is not None:
             arrays["gradients"] = self.gradients
-        out, held = ffi.new("surface *", {"m": m, "k": k, "K": K}), []
+        out, held = ray().ffi.new("surface *", {"m": m, "k": k, "K": K}), []
         for name, array in arrays.items():
-            kind = "double" if array.dtype.kind == "f" else "int64_t"
-            held.append(np.ascontiguousarray(array, dtype=np.float64 if kind == "double" else np.int64))
-            setattr(out, name, ffi.cast(f"{kind} *", held[-1].ctypes.data))
+            held.append(np.ascontiguousarray(array, dtype=np.float64 if array.dtype.kind == "f" else np.int64))
+            setattr(out, name, _pointer(held[-1]))
         return out, held
 
     def reversed(self) -> Surface:
@@ -237,17 +235,15 @@ def ray_points(
         ArithmeticError: The deformed die is no graph over p, or the slave is nowhere (an iterate gone astray).
     """
     library = ray()
-    ffi, vertex = library.ffi, np.empty(len(die.X) + 1)
+    vertex = np.empty(len(die.X) + 1)
     s, omega = gauss(order)
     z = np.ascontiguousarray(z, dtype=np.float64)
     if len(z) < 2 * max(slave._last_node, die._last_node) + 2:
         raise IndexError(f"z holds {len(z)} entries, the surfaces' nodes go to {max(slave._last_node, die._last_node)}")
 
-    def pointer(array: NDArray[Any]) -> Any:
-        return ffi.cast(POINTERS[array.dtype.char], array.ctypes.data)
-
-    into = slave._compiled[0], die._compiled[0], pointer(z), axis, sign, order, pointer(s), pointer(omega), axisymmetric
-    n = library.lib.ray_points(*into, pointer(vertex), ffi.NULL)
+    of = slave._compiled[0], die._compiled[0], _pointer(z), axis, sign, order
+    into = *of, _pointer(s), _pointer(omega), axisymmetric, _pointer(vertex)
+    n = library.lib.ray_points(*into, library.ffi.NULL)
     if n < 0:
         raise ArithmeticError("the deformed die is no graph over the ray's base line")
     L = 2 * (slave.cell_nodes.shape[1] + die.nodes.shape[1])
@@ -255,18 +251,20 @@ def ray_points(
     xi, weight, gap, slope, gap_xi = np.empty((5, n, order))
     G, G_xi, a, b, dxi, dweight = np.empty((6, n, order, L))
     past = np.empty((n, order), dtype=np.bool_)
-    out = ffi.new("points *")
+    out = library.ffi.new("points *")
     (
         out.facet, out.die, out.cols, out.xi, out.weight, out.gap, out.slope, out.gap_xi, out.past,
         out.G, out.G_xi, out.left, out.right, out.dxi, out.dweight,
-    ) = map(pointer, (facet, on, cols, xi, weight, gap, slope, gap_xi, past, G, G_xi, a, b, dxi, dweight))  # fmt: skip
-    filled = library.lib.ray_points(*into, pointer(vertex), out)
+    ) = map(_pointer, (facet, on, cols, xi, weight, gap, slope, gap_xi, past, G, G_xi, a, b, dxi, dweight))  # fmt: skip
+    filled = library.lib.ray_points(*into, out)
     assert filled == n
     return Points(facet, on, cols, xi, weight, gap, G, slope, past, gap_xi, G_xi, ((a, b), (b, a)), dxi, dweight)
 
 
-POINTERS = {"d": "double *", "l": "int64_t *", "?": "int8_t *"}
-"""C's pointers to NumPy's types."""
+def _pointer(array: NDArray[Any]) -> Any:
+    """C's pointer to a contiguous array's numbers, which must outlive it."""
+    kind = {"f": "double *", "i": "int64_t *", "b": "int8_t *"}[array.dtype.kind]
+    return ray().ffi.cast(kind, array.ctypes.data)
 
 
 def least_gap(slave: Surface, die: Surface, z: Array, axis: int, sign: float) -> float:
@@ -314,8 +312,7 @@ def stress_rows(
         Rows ``shape=(n, q, 2 K + between)`` in MPa/mm (and 3 more, over the pressures, if the surface has them).
     """
     mixed, K = slave.pressure_cols is not None, slave.cell_nodes.shape[1]
-    library, (n, q) = ray(), xi.shape
-    cast = library.ffi.cast
+    n, q = xi.shape
     if slave.tabulate is None:
         raise ValueError("the surface has no cells behind it")
     facet, xi = np.ascontiguousarray(facet, dtype=np.int64), np.ascontiguousarray(xi)
@@ -323,10 +320,9 @@ def stress_rows(
     if d.strides[2] != d.itemsize:
         d = np.ascontiguousarray(d)
     rows = np.zeros((n, q, 2 * K + between + 3 * mixed))
-    library.lib.stress_rows(
-        slave._compiled[0], n, q, cast("int64_t *", facet.ctypes.data), cast("double *", xi.ctypes.data),
-        cast("double *", d.ctypes.data), d.strides[0] // d.itemsize, d.strides[1] // d.itemsize, lmbda, mu,
-        axisymmetric, derivative, rows.shape[2], 2 * K + between if mixed else -1, cast("double *", rows.ctypes.data),
+    ray().lib.stress_rows(
+        slave._compiled[0], n, q, _pointer(facet), _pointer(xi), _pointer(d), *(i // d.itemsize for i in d.strides[:2]),
+        lmbda, mu, axisymmetric, derivative, rows.shape[2], 2 * K + between if mixed else -1, _pointer(rows),
     )  # fmt: skip
     return rows
 

@@ -124,7 +124,7 @@ int64_t ray_points(const surface* slave, const surface* die, const double* z, in
       const int after = opposite >= m, outside = after || opposite < 0;
       const int64_t e = opposite < 0 ? 0 : after ? m - 1 : opposite;
       place(die, e, z, xd);
-      double xi1 = 1, N1[3], speed1 = 1, at[2];
+      double xi1 = 1, N1[3] = {0}, speed1 = 1, at[2];
       int64_t v1 = -1;
       if (nth + 1 < pieces)
       {

@@ -318,8 +318,7 @@ class IntegratedContact:
 
     def _found(self, z: Array) -> ContactSet | None:
         points, S, _ = self._points(z)
-        k = self._k[points.facet][:, None]
-        trial = k * points.gap if S is None else k * points.gap + np.einsum("nql,nl->nq", S, z[points.cols])
+        trial = self._trial(z, points, S)[1]
         closed = trial < 0.0
         if not self.pair.extended:
             closed &= ~points.past
@@ -349,11 +348,15 @@ class IntegratedContact:
             self._known = z.copy(), self.pair.points(z, self._order, variation, self._material, self._held)
         return self._known[1]
 
-    def _law(self, z: Array, points: Points, S: Array | None) -> tuple[Array, Array, Array, Array]:
+    def _trial(self, z: Array, points: Points, S: Array | None) -> tuple[Array, Array, Array]:
+        """The slave's own stress, the trial stress, and k."""
         k = self._k[points.facet][:, None]
         own = np.einsum("nql,nl->nq", S, z[points.cols]) if S is not None else np.zeros_like(points.gap)
+        return own, own + k * points.gap, k
+
+    def _law(self, z: Array, points: Points, S: Array | None) -> tuple[Array, Array, Array, Array]:
+        own, trial, k = self._trial(z, points, S)
         held = np.broadcast_to(self.closed[points.facet][:, None], own.shape)
-        trial = own + k * points.gap
         if self._expected.on:
             sc, dsc = self._expected.law(trial, self.pair.along(z, points))
         else:
