@@ -177,7 +177,7 @@ class Newton:
         y, trial, f, ksp = self._step, self._trial, self._trial_f, self.snes.getKSP()
         self.problem.residual(x, f)
         before = float(f.norm())
-        if not np.isfinite(before):
+        if not before > self.tolerance:  # there is nothing to predict, or nothing to be had of it
             self.problem.expect(None)
             return 0
         A = self.problem.tangent(x, False)

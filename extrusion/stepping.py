@@ -33,8 +33,8 @@ PASSES = 30
 ROUGH = 4
 """Passes that may be solved roughly, as long as the pairing still changes by a tenth of the increment."""
 
-AT_MOST = 2
-"""Linear solves of a rough pass."""
+AT_MOST = 1
+"""Linear solves of a rough pass, beside the one that takes the contact set of the pass before."""
 
 SETTLE = 3
 """Passes after which a node that rests on a die vertex stays with the facet it had."""
@@ -174,7 +174,7 @@ def _increment(problem: System, newton: Newton, accepted: PETSc.Vec, ahead: floa
         problem.pair_up(x, settle=attempt > (SETTLE if frozen else 1))
         x.copy(previous)
         rough &= attempt <= ROUGH
-        outcome = newton.solve(x, AT_MOST if rough else None, ahead)
+        outcome = newton.solve(x, AT_MOST if rough else None, 0.0 if frozen and attempt > 1 else ahead)
         iterations += outcome.iterations
         if not outcome.converged and not (rough and np.isfinite(outcome.residual)):
             if attempt == 1 and problem.may_settle:

@@ -152,10 +152,7 @@ class System(ABC):
             term.hold(z)
 
     def expect(self, ahead: float | None) -> bool:
-        """Take the contact set that is expected in the die as given; say if any zone has one. None: no more.
-
-        ``ahead``: this increment over the last one, by which the set's edges are moved on.
-        """
+        """Take the contact set that is expected as given (`ContactTerm.expect`); say if any zone has one."""
         return any([term.expect(ahead) for term in self.terms])
 
     # -- reports ---------------------------------------------------------------------------------------------

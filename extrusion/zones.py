@@ -57,7 +57,10 @@ class ContactTerm(Protocol):
         """Make z the accepted state."""
 
     def expect(self, ahead: float | None) -> bool:
-        """Take the contact set that is expected in the die for given (`Expected.expect`); say if there is one."""
+        """Take the contact set that is expected for given (`Expected.expect`), and say if there is one.
+
+        ``ahead``: this increment over the last; 0: it goes on, with another pairing; None: expect nothing any more.
+        """
 
     def state(self, z: Array) -> ContactState:
         """Report at z."""
@@ -175,6 +178,8 @@ class NodalContact:
         self._radius, self._interpenetrating = radius, interpenetrating
         self.closed, self.caught = np.zeros(len(self.nodes), dtype=bool), 0.0
         self._facet: Index | None = None
+        self._last: np.ndarray | None = None  # nodes that the last pairing's solve left closed
+        self._expects = False
 
     def start(self, z: Array) -> None:
         self.pair_up(z)
@@ -183,6 +188,7 @@ class NodalContact:
         self.caught = _farthest(gap, self.closed)
 
     def pair_up(self, z: Array, settle: bool = False) -> None:
+        self._last = self._law(z)[2] > 0 if self.multipliers and self._facet is not None else None
         found = self.pair.at_nodes(z, self._facet if settle else None)
         self._G, self._cols, self._past, self._cos = found.G, found.cols, found.past, found.cos
         self._facet = found.facet
@@ -195,7 +201,9 @@ class NodalContact:
         pass
 
     def expect(self, ahead: float | None) -> bool:
-        return False
+        # across an increment other nodes come to lie where the die is met; from pass to pass they are the same
+        self._expects = ahead == 0.0 and self._last is not None
+        return self._expects
 
     def stiffness_norm(self) -> float:
         return float(np.linalg.norm(self._kappa)) if self.multipliers else 0.0
@@ -206,7 +214,11 @@ class NodalContact:
     def _law(self, z: Array) -> tuple[Array, Array, Array]:
         lam = z[self.at]
         gap = self._g0 + self._apply(z)
-        sc, dsc = project(lam + self._kappa * gap, self.pair.closure, self.closed)
+        trial = lam + self._kappa * gap
+        if self._expects and self._last is not None:
+            sc, dsc = np.where(self._last, trial, 0.0), self._last.astype(float)
+        else:
+            sc, dsc = project(trial, self.pair.closure, self.closed)
         if not self.pair.extended:
             sc, dsc = np.where(self._past, 0.0, sc), np.where(self._past, 0.0, dsc)
         return gap, sc, dsc
