@@ -6,6 +6,8 @@ that need it, so that help and lists are quick.
 
 from __future__ import annotations
 
+import atexit
+import gc
 import importlib.util
 import json
 import logging
@@ -123,6 +125,10 @@ def run(
         bool, typer.Option("--adapt", help="Refine a mesh where the goal needs it, until it has the tolerance.")
     ] = False,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for files; by default results/CASE.")] = None,
+    pictures: Annotated[
+        bool,
+        typer.Option("--pictures/--no-pictures", help="Draw pictures; else `extrusion plot` does, from the files."),
+    ] = True,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the result as one JSON object; - is stdout.")
     ] = None,
@@ -158,6 +164,7 @@ def run(
             result = solve(
                 scene,
                 out=out,
+                pictures=pictures,
                 observers=observers,
                 solver=solver,
                 tolerance=tolerance,
@@ -388,6 +395,7 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
     Args:
         args: What follows the command's name; by default what the shell gave.
     """
+    atexit.register(gc.freeze)  # the interpreter would look for cycles in all that is left, for a third of a second
     try:
         command = typer.main.get_command(app)
         status = command.main(None if args is None else [*args], prog_name="extrusion", standalone_mode=False)

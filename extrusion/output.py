@@ -59,13 +59,14 @@ class Folder:
     Args:
         path: Where; parents are made too.
         comm: The ranks of the run.
+        pictures: Draw them, which takes as long as a small run.
 
     Raises:
         InputError: On every rank, if the folder cannot be written.
     """
 
-    def __init__(self, path: str | Path, comm: MPI.Intracomm) -> None:
-        self.path, self._comm = Path(path), comm
+    def __init__(self, path: str | Path, comm: MPI.Intracomm, pictures: bool = True) -> None:
+        self.path, self._comm, self._pictures = Path(path), comm, pictures
         self.observers: list[Observer] = [History(path), Contact(path), Fields(path)]
 
         def make() -> None:
@@ -83,6 +84,8 @@ class Folder:
         def draw() -> None:
             if result.snapshots is not None:
                 np.savez_compressed(self.path / "snapshots.npz", **vars(result.snapshots))
+            if not self._pictures:
+                return
             if importlib.util.find_spec("matplotlib") is None:
                 log.warning('pictures skipped: matplotlib is not installed (pip install "extrusion[plot]")')
             elif result.steps:

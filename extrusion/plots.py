@@ -146,8 +146,10 @@ def billet(record: Record) -> Figure:
     n = len(order)
     height = 5.2
     width = height * 0.8 * 2 * rim / (top - bottom)
-    figure = _figure(record, n * width + 2.2, height)
+    total = n * width + 2.1
+    figure = _figure(record, total, height, right=1.3)
     axes = figure.subplots(1, n, sharey=True, squeeze=False)[0]
+    bar = figure.add_axes((1 - 1.15 / total, 0.16, 0.2 / total, 0.66))
     stress = snapshots.von_mises[:, snapshots.billet]
     norm = Normalize(0.0, max(_most(stress, snapshots), 1e-6 * record.case.billet.E))
     cells = None
@@ -170,7 +172,7 @@ def billet(record: Record) -> Figure:
         ax.tick_params(direction="out", top=False, right=False)
     axes[0].set_ylabel("y [mm]")
     peak = f"von Mises stress [MPa], peak {stress.max():.4g}"
-    figure.colorbar(cells, ax=axes, label=peak, shrink=0.9, pad=0.02, extend="max")
+    figure.colorbar(cells, cax=bar, label=peak, extend="max")
     return figure
 
 
@@ -273,11 +275,17 @@ def rings(y: Array, p: Array, width: float) -> tuple[Array, Array, Array, Array]
     return mean[0], mean[1], np.minimum.reduceat(p, starts), np.maximum.reduceat(p, starts)
 
 
-def _figure(record: Record, width: float, height: float) -> Figure:
-    """An empty figure (inches) outside pyplot, with the run as its title; a notebook shows it."""
+def _figure(record: Record, width: float, height: float, right: float = 0.2) -> Figure:
+    """An empty figure (inches) outside pyplot, with the run as its title; a notebook shows it.
+
+    Its margins are set: to find them out, matplotlib would draw all text twice.
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height))
+    figure.subplots_adjust(
+        *(0.75 / width, 0.55 / height, 1 - right / width, 1 - 0.6 / height), wspace=0.04, hspace=0.08
+    )
     case = record.case
     figure.suptitle(f"Case {case.name}: {case.method}, {element_name(case)}, {case.die} die", fontsize="medium")
 

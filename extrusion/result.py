@@ -289,6 +289,7 @@ def run(
     comm: MPI.Intracomm | None = None,
     observers: Sequence[Observer] = (),
     out: str | Path | None = None,
+    pictures: bool = True,
     solver: str = "auto",
     tolerance: float | None = None,
     goal: Goal = "K",
@@ -303,6 +304,7 @@ def run(
         comm: Ranks that share the work; all by default.
         observers: Called as ``observer(problem, step)`` after each accepted step.
         out: Folder for files and pictures; without it nothing is written.
+        pictures: Draw them; else `extrusion plot` draws them from the files.
         solver: "surface" (the bulk factored once, Newton's method on the forces of contact), "full" (on all unknowns),
             "iterative" (these by multigrid, in 3D), or "auto": the one that is estimated to be cheapest. All give the
             same answer.
@@ -359,7 +361,7 @@ def run(
     problem = Problem(case, _mesh(comm, case, plain), comm)
     seconds = {"setup": time.perf_counter() - start, "solve": 0.0, "output": 0.0}
     camera = output.Camera(case, PICTURED)
-    folder = None if out is None else output.Folder(out, comm)
+    folder = None if out is None else output.Folder(out, comm, pictures)
     watching = [camera, *(() if folder is None else folder.observers), *observers]
     began = time.perf_counter()
     system = choose(problem, solver)

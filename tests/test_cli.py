@@ -206,11 +206,10 @@ def test_verify_of_a_figure_not_reached(here: Path, capsys: Capture, monkeypatch
 
 
 def test_plot(here: Path, capsys: Capture) -> None:
-    """Pictures can be drawn again from the files."""
+    """Pictures can be drawn from the files, if they were not wanted before."""
     pytest.importorskip("matplotlib")
-    assert command("run", "A", "--until", "20", "--out", "here", "--quiet") == 0
-    for path in Path("here").glob("*.png"):
-        path.unlink()
+    assert command("run", "A", "--until", "20", "--out", "here", "--quiet", "--no-pictures") == 0
+    assert not list(Path("here").glob("*.png"))
     assert command("plot", "here") == 0
     assert capsys.readouterr().out.split() == ["here/billet.png", "here/history.png", "here/pressure.png"]
     assert all(path.stat().st_size > 10_000 for path in Path("here").glob("*.png"))
