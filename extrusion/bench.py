@@ -125,7 +125,7 @@ def solve(cell: Cell, mesh: str | None = None) -> Outcome:
     """Run one cell in this process, on a mesh file or on the mesh that is shipped."""
     from mpi4py import MPI
 
-    from extrusion.condensed import Condensed, choose, surface_memory
+    from extrusion.condensed import Condensed, choose
     from extrusion.mesh import case_mesh, read_mesh
     from extrusion.newton import Newton
     from extrusion.problem import Problem
@@ -168,7 +168,7 @@ def solve(cell: Cell, mesh: str | None = None) -> Outcome:
         base=base,
         memory_factor=memory_factor,
         memory=resident_memory("VmHWM"),
-        compliance=surface_memory(problem) / 1e6 if isinstance(system, Condensed) else 0.0,
+        compliance=system.compliance_memory / 1e6 if isinstance(system, Condensed) else 0.0,
         **({} if note else _errors(case, found)),
     )
 

@@ -1,4 +1,6 @@
-"""The contact points of curves in C, compiled when first used, and kept, as DOLFINx compiles and keeps its forms."""
+"""What is in C, contact points of curves and blocks of the compliance: compiled when first used, and kept, as DOLFINx
+compiles and keeps its forms.
+"""
 
 from __future__ import annotations
 
@@ -22,39 +24,51 @@ from extrusion.errors import InputError
 
 
 @cache
-def ray() -> ModuleType:
-    """``ray.c`` as a module of cffi (``ray().lib``, ``ray().ffi``), from DOLFINx's cache of compiled forms.
+def library(name: str) -> ModuleType:
+    """``ray.c`` or ``blocks.c`` as a module of cffi (with ``lib`` and ``ffi``), from DOLFINx's cache of compiled forms.
 
     Processes that find nothing there compile each for itself, and one of the results stays.
 
     Raises:
         InputError: There is no C compiler that works, or the cache cannot be written.
     """
-    header, source = (resources.files("extrusion").joinpath(f"ray.{kind}").read_text("utf-8") for kind in "hc")
+    header, source = (resources.files("extrusion").joinpath(f"{name}.{kind}").read_text("utf-8") for kind in "hc")
     options = get_options()
     arguments = [*options["cffi_extra_compile_args"], "-std=c17", "-O3", "-fno-fast-math", "-ffp-contract=off"]
     suffix = sysconfig.get_config_var("EXT_SUFFIX")
     key = repr((header, source, arguments, cffi.__version__, suffix))
-    name = f"extrusion_ray_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+    module_name = f"extrusion_{name}_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
     folder = Path(options["cache_dir"])
-    library = folder / f"{name}{suffix}"
-    if not library.exists():
+    path = folder / f"{module_name}{suffix}"
+    if not path.exists():
         ffi = cffi.FFI()
         ffi.cdef(header)
-        ffi.set_source(name, f"#include <stdint.h>\n{header}{source}", extra_compile_args=arguments)
+        ffi.set_source(module_name, f"#include <stdint.h>\n{header}{source}", extra_compile_args=arguments)
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder) as there:
-                os.replace(ffi.compile(tmpdir=there), library)
+                os.replace(ffi.compile(tmpdir=there), path)
         except OSError as error:
             remedy = f"cannot be written ({error.strerror}): let XDG_CACHE_HOME name another folder"
             raise InputError("cache_dir", str(folder), remedy) from None
         except Exception as error:  # cffi's own, or setuptools'
-            remedy = f"ray.c does not compile ({str(error).splitlines()[0]}): install a C compiler and Python's headers"
+            remedy = (
+                f"{name}.c does not compile ({str(error).splitlines()[0]}): install a C compiler and Python's headers"
+            )
             raise InputError("CC", os.environ.get("CC", "cc"), remedy) from None
-    spec = importlib.util.spec_from_file_location(name, library)
+    spec = importlib.util.spec_from_file_location(module_name, path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def ray() -> ModuleType:
+    """The contact points of curves (`library`)."""
+    return library("ray")
+
+
+def blocks() -> ModuleType:
+    """Blocks of the compliance (`library`)."""
+    return library("blocks")

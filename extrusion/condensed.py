@@ -4,8 +4,8 @@ The bulk is linear. With E the entries that contact can put forces f on, the dis
 
     u = t d - K^-1 E^T f        t: displacement of the rear face, d: the billet moved as a whole by 1
 
-so what contact reads of them is ``u_c = t d_c - C f`` with the compliance C, a dense matrix of which one column is one
-solve with the factor of K. The unknown is x = (t, f, multipliers) and the residual, in newtons, is::
+so what contact reads of them is ``u_c = t d_c - C f`` with the compliance C, of which one column is one solve with the
+factor of K (`extrusion.compliance`). The unknown is x = (t, f, multipliers) and the residual, in newtons, is::
 
     R(z) - f        R: contact's forces at the contact vector z = (u_c, multipliers)
 
@@ -35,6 +35,7 @@ import scipy.sparse
 
 from dolfinx.fem.petsc import get_petsc_lib
 
+from extrusion.compliance import Blocks, Compliance
 from extrusion.errors import InputError
 from extrusion.gap import Array, Index
 from extrusion.problem import BILLET_POINTS, Problem
@@ -43,12 +44,6 @@ from extrusion.system import System, in_words, node_positions
 log = logging.getLogger(__name__)
 
 SOLVERS = ("auto", "surface", "full", "iterative")
-
-BLOCK = 256
-"""Right-hand sides that are solved for together."""
-
-MARGIN = 128
-"""Forces along the surface, to both sides of those that are needed, that are made ready with them."""
 
 
 def choose(problem: Problem, solver: str = "auto") -> System:
@@ -93,7 +88,7 @@ def choose(problem: Problem, solver: str = "auto") -> System:
 
 
 def surface_memory(problem: Problem) -> float:
-    """Bytes of the compliance with all of its columns, body by body, and of its copy in single precision if any."""
+    """Bytes that the compliance takes at most: with all of its columns, and a copy in single precision, if any."""
     full = np.zeros(problem.n_z, dtype=bool)
     full[np.concatenate([term.forced for term in problem.terms])] = True
     n_u = problem.dim * len(problem.z_in_billet)
@@ -192,8 +187,9 @@ class Condensed(System):
         self._watched_drive, self._watched_start = full.drive_at(watched), full.start_at(watched)
 
         forced = np.concatenate([term.forced for term in self.terms])
-        forced = forced[np.sort(np.unique(forced, return_index=True)[1])]
-        self.z_forced = forced[full.z_free[forced]]
+        forced = np.unique(forced)
+        forced = forced[full.z_free[forced]]
+        self.z_forced = forced[np.argsort(self._row_of_z[forced])]  # body by body, along the surface
         self.n_forces = len(self.z_forced)
         self._force_of_z = np.full(self.n_z, -1)
         self._force_of_z[self.z_forced] = np.arange(self.n_forces)
@@ -229,14 +225,13 @@ class Condensed(System):
     def _factor(self) -> None:
         began = time.perf_counter()
         self._bulk = [_Factor(A, rows) for A, rows in self.full.bulk()]
-        # C of each body, a row for each of its forces, made on demand (until then they take no memory)
-        self.of_body = [np.flatnonzero(self.force_body == body) for body in (0, 1)]
-        self.place = np.zeros(self.n_forces, dtype=np.int64)  # of a force among its body's
-        for forces in self.of_body:
-            self.place[forces] = np.arange(len(forces))
-        shapes = [(len(forces), rows.stop - rows.start) for forces, rows in zip(self.of_body, self.bodies, strict=True)]
-        self.C = [np.zeros(shape if self.on_root else (0, 0)) for shape in shapes]
-        self._made = np.zeros(self.n_forces, dtype=bool)
+        of_billet = int(np.sum(self.force_body == 0))
+        self.of_body = [slice(0, of_billet), slice(of_billet, self.n_forces)]
+        single = _precision(self.case.method, self.n_forces) == np.float32
+        self.C = [  # of each body, a row for each of its forces
+            Compliance(self._row_of_z[self.z_forced[of]] - rows.start, self.node[of], rows.stop - rows.start, single)
+            for of, rows in zip(self.of_body, self.bodies, strict=True)
+        ]
         self._drive_norm = self.full.size_of_drive()
         self.seconds = {"factor": time.perf_counter() - began, "condensation": 0.0}
         bodies = np.bincount(self.force_body, minlength=2)
@@ -249,42 +244,38 @@ class Condensed(System):
         )
 
     @property
+    def compliance_memory(self) -> int:
+        """Bytes of the compliance made so far, on rank 0."""
+        return sum(C.nbytes for C in self.C)
+
+    @property
     def right_hand_sides(self) -> int:
-        """Columns of the compliance made so far."""
-        return int(self._made.sum())
+        """Columns of the compliance made so far, on rank 0."""
+        return sum(C.made for C in self.C)
 
     def provide(self, wanted: Index) -> None:
         """Make the columns of C for some forces (given on rank 0), and for those beside them. Collective."""
-        missing = wanted[~self._made[wanted]] if self.on_root else wanted
+        missing: list[tuple[int, int]] = []
+        if self.on_root:
+            for body, (C, of) in enumerate(zip(self.C, self.of_body, strict=True)):
+                if not (body == 1 and self._stiff_die):
+                    mine = wanted[self.force_body[wanted] == body] - of.start
+                    missing += [(body, number) for number in C.missing(mine)]
         if self.comm.size > 1:
-            missing = self.comm.bcast(missing if len(missing) else None)
-        if missing is None or not len(missing):
+            missing = self.comm.bcast(missing)
+        if not missing:
             return
         began = time.perf_counter()
-        near = np.zeros(self.n_forces, dtype=bool)
-        near[missing] = True
-        new = (np.convolve(near, np.ones(2 * MARGIN + 1))[MARGIN:-MARGIN] > 0) & ~self._made
-        for body, (C, forces) in enumerate(zip(self.C, self.of_body, strict=True)):
-            if body == 1 and self._stiff_die:
-                continue
-            rows = np.flatnonzero(new[forces])
-            for some in (rows[i : i + BLOCK] for i in range(0, len(rows), BLOCK)):
-                u = self._bulk[body].solve(self._force_dofs[forces[some]], self.dofs[self.bodies[body]])
-                if self.on_root:
-                    C[some] = u
-        self._made |= new
+        for body, number in missing:
+            forces = self._force_dofs[self.of_body[body]][self.C[body].blocks[number]]
+            u = self._bulk[body].solve(forces, self.dofs[self.bodies[body]])
+            if self.on_root:
+                self.C[body].make(number, u)
         self.seconds["condensation"] += time.perf_counter() - began
 
     def displacements(self, f: Array) -> Array:
         """-C f at all rows; on rank 0."""
-        out = np.zeros(self.n_read)
-        for body, C, forces in zip(self.bodies, self.C, self.of_body, strict=True):
-            of = f[forces]
-            on = np.flatnonzero(of)
-            if len(on):  # contact is somewhere along the body, and so are they
-                some = slice(on[0], on[-1] + 1)
-                out[body] = -of[some] @ C[some]
-        return out
+        return -np.concatenate([C.displacements(f[of]) for of, C in zip(self.of_body, self.C, strict=True)])
 
     def die_effect(self, x: PETSc.Vec) -> tuple[float, float]:
         """How an elastic die would move K (mm) and change the reaction (N), to first order.
@@ -602,11 +593,7 @@ class _Tangent:
         self._last_norm = np.inf
         self._getrs = scipy.linalg.get_lapack_funcs("getrs", dtype=self._dtype)
         # of each body, which forces have a part in the solve, and the rows of C that are read
-        self._held = [(np.zeros(len(C), dtype=bool), slice(0, 0)) for C in system.C]
-        # C in the precision of the solve, and which of its columns (rows here) are filled in
-        single = self._dtype == np.float32
-        self._C = [np.zeros(C.shape, dtype=self._dtype) if single else C for C in system.C]
-        self._filled = [np.zeros(len(C), dtype=bool) for C in system.C]
+        self._held = [(np.zeros(C.shape[0], dtype=bool), slice(0, 0)) for C in system.C]
         self._pressed = np.zeros(system.n_multipliers, dtype=bool)  # multipliers that have a part in the solve
         self.forget()
 
@@ -673,16 +660,14 @@ class _Tangent:
             if np.array_equal(act, held) and reach == span:
                 continue
             self._held[body], changes = (act, reach), True
-            if self._C[body] is not system.C[body]:
-                new = act & ~self._filled[body]
-                self._C[body][new] = system.C[body][new]
-                self._filled[body] |= new
         if not changes:
             return
         self.forget()
         self._pressed = pressed | self._pressed if same else pressed
         p = np.flatnonzero(self._pressed)
-        held_forces = [forces[held] for forces, (held, _) in zip(system.of_body, self._held, strict=True)]
+        held_forces = [
+            of.start + np.flatnonzero(held) for of, (held, _) in zip(system.of_body, self._held, strict=True)
+        ]
         held_rows = [
             body.start + np.arange(span.start, span.stop)
             for body, (_, span) in zip(system.bodies, self._held, strict=True)
@@ -706,7 +691,7 @@ class _Tangent:
         body = np.append(system.force_body, np.full(system.n_multipliers, 2))[self._entries]
         part = np.where(body == 2, 2, 3 + body)
         part[leads] = body[leads]
-        order = np.argsort(part, kind="stable")
+        order = np.lexsort((self._entries, part))
         ends = [0, *np.cumsum(np.bincount(part, minlength=5)).tolist()]
         n, kept = self._n, self._kept = ends[2], ends[3]
         follower, two = self._entries[follower], self._entries[two]
@@ -714,16 +699,19 @@ class _Tangent:
         self._follower, self._two, self._slope = self._row[follower], self._row[two], slope.astype(self._dtype)
         self._D = self._D[order]
         self._B = self._D[:kept, :n_u]
-        self._parts = []
+        C_E, C_h = [], []
         M = np.zeros((kept, kept), dtype=self._dtype)
         E = scipy.sparse.csr_array((self._slope, (self._two, self._follower)), shape=(kept, len(order)))
         for b, cols in enumerate((slice(self._from_die), slice(self._from_die, n_u))):
             lead, other = slice(ends[b], ends[b + 1]), slice(ends[b + 3], ends[b + 4])
-            C = self._C[b][:, self._held[b][1]]
-            C_E, C_h = (C[system.place[self._entries[rows]]] for rows in (lead, other))
-            C_E += E[lead, other] @ C_h
-            M[:, lead] = self._B[:, cols] @ np.ascontiguousarray(C_E.T)
-            self._parts.append((lead, other, C_E, C_h))
+            of = (self._entries[rows] - system.of_body[b].start for rows in (lead, other))
+            B = self._B[:, cols]
+            for k, o, with_others, others in system.C[b].parts(*of, E[lead, other], self._held[b][1]):
+                first = lead.start + k
+                M[:, first : first + len(with_others.D)] = B @ np.ascontiguousarray(with_others.whole().T)
+                C_E.append((first, cols.start or 0, with_others))
+                C_h.append((other.start + o, cols.start or 0, others))
+        self._C_E, self._C_h = Blocks(C_E), Blocks(C_h)
         M[n:, :n] *= -1.0
         M[np.arange(n), np.arange(n)] += 1.0
         pressed = self._D[:kept, n_u:].toarray()
@@ -759,15 +747,17 @@ class _Tangent:
         n, kept = self._n, self._kept
         F = F.astype(self._dtype)  # a copy
         F[self._follower] -= self._slope * F[self._two]
-        by_h = [F[others] @ C_h for _, others, _, C_h in self._parts]
-        w = self._B @ np.concatenate(by_h)
+        u = np.zeros(len(self._cols), dtype=self._dtype)
+        self._C_h.add(F, u)
+        w = self._B @ u[: self._B.shape[1]]
         w[:n] -= F[:n]
         w[n:] = F[n:kept] - w[n:]
         w = self._getrs(*self._lu, w, trans=1, overwrite_b=True)[0]
-        u = [of_h - w[leads] @ C_E for of_h, (leads, _, C_E, _) in zip(by_h, self._parts, strict=True)]
+        self._C_E.add(-w, u)
+        u[self._B.shape[1] :] = w[n:]
         x = np.concatenate([w, -F[kept:]])
         x[self._follower] += self._slope * w[self._two]
-        image = self._D @ np.concatenate([*u, w[n:]])
+        image = self._D @ u
         image[:n] -= x[:n]
         image[kept:] -= x[kept:]
         return x, image

@@ -263,8 +263,8 @@ def ray_points(
 
 def _pointer(array: NDArray[Any]) -> Any:
     """C's pointer to a contiguous array's numbers, which must outlive it."""
-    kind = {"f": "double *", "i": "int64_t *", "b": "int8_t *"}[array.dtype.kind]
-    return ray().ffi.cast(kind, array.ctypes.data)
+    kind = {"f": "double[]", "i": "int64_t[]", "b": "int8_t[]"}[array.dtype.kind]
+    return ray().ffi.from_buffer(kind, array)
 
 
 def least_gap(slave: Surface, die: Surface, z: Array, axis: int, sign: float) -> float:
@@ -319,9 +319,10 @@ def stress_rows(
     d = np.broadcast_to(np.asarray(direction, dtype=np.float64), (n, q, 2))
     if d.strides[2] != d.itemsize:
         d = np.ascontiguousarray(d)
+    strided = ray().ffi.cast("double *", d.ctypes.data)
     rows = np.zeros((n, q, 2 * K + between + 3 * mixed))
     ray().lib.stress_rows(
-        slave._compiled[0], n, q, _pointer(facet), _pointer(xi), _pointer(d), *(i // d.itemsize for i in d.strides[:2]),
+        slave._compiled[0], n, q, _pointer(facet), _pointer(xi), strided, *(i // d.itemsize for i in d.strides[:2]),
         lmbda, mu, axisymmetric, derivative, rows.shape[2], 2 * K + between if mixed else -1, _pointer(rows),
     )  # fmt: skip
     return rows

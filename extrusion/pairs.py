@@ -94,8 +94,11 @@ class Pair(ABC):
         """Their reference positions, ``shape=(n, dim)``, mm."""
 
     @abstractmethod
-    def at_nodes(self, z: Array, keep: Index | None = None) -> NodeRows:
-        """The gap at the slave's nodes; ``keep`` are facets of an earlier pairing to stay with (`closest_points`)."""
+    def at_nodes(self, z: Array, keep: Index | None = None, which: Index | slice = slice(None)) -> NodeRows:
+        """The gap at the slave's nodes, or which of these.
+
+        ``keep`` are facets of an earlier pairing to stay with (`closest_points`).
+        """
 
     @abstractmethod
     def nodal_weights(self) -> Array:
@@ -174,10 +177,6 @@ class Pair(ABC):
         """Whether the surfaces are too far apart for contact, or for Nitsche's trial stress, whose k gap outweighs."""
         return self.ray and self.closure == "unilateral" and self.least_gap(z) > FAR * radius
 
-    def gap_at_nodes(self, z: Array) -> tuple[Index, Array]:
-        """Slave nodes in order and the zone's gap there, mm."""
-        return self.nodes, self.at_nodes(z).gap
-
     def displacement(self, z: Array, nodes: Index) -> Array:
         """Of some nodes, ``shape=(*nodes.shape, dim)``, mm."""
         return np.asarray(z[self.dim * nodes[..., None] + np.arange(self.dim)])
@@ -224,9 +223,9 @@ class CurvePair(Pair):
     def X(self) -> Array:
         return polyline_points(self.slave)
 
-    def at_nodes(self, z: Array, keep: Index | None = None) -> NodeRows:
-        nodes = self.nodes
-        x = self.X + self.displacement(z, nodes)
+    def at_nodes(self, z: Array, keep: Index | None = None, which: Index | slice = slice(None)) -> NodeRows:
+        nodes = self.nodes[which]
+        x = self.X[which] + self.displacement(z, nodes)
         if self.ray:
             return self._ray_rows(nodes, x, z)
         ones = np.ones((len(x), 1))

@@ -53,8 +53,8 @@ class SurfacePair(Pair):
     def _rays(self, X: Array) -> Array:
         return self.sign * (radial(X) if self.axis == 0 else np.broadcast_to([0.0, 1.0, 0.0], X.shape))
 
-    def at_nodes(self, z: Array, keep: Index | None = None) -> NodeRows:
-        nodes, X = self.nodes, self.X
+    def at_nodes(self, z: Array, keep: Index | None = None, which: Index | slice = slice(None)) -> NodeRows:
+        nodes, X = self.nodes[which], self.X[which]
         x = X + self.displacement(z, nodes)
         N = self._rays(X)
         if self.ray:

@@ -6,6 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from typing import Any
 
 from mpi4py import MPI
@@ -183,16 +184,28 @@ class System(ABC):
     def point_gaps(self, x: PETSc.Vec) -> dict[str, float]:
         """Gap at the billet's corners K, L, M as the first zone that holds them measures it, mm."""
         z = self.gather(x)
-        corners = self.case.profile.points
         out: dict[str, float] = {}
+        for term, corners in zip(self.terms, self._corners, strict=True):
+            if corners:
+                gaps = term.pair.at_nodes(z, which=np.array([*corners.values()])).gap
+                out.update(zip(corners, gaps.tolist(), strict=True))
+        return out
+
+    @cached_property
+    def _corners(self) -> list[dict[str, int]]:
+        """For each zone, which of its nodes are corners of the billet that no zone before it has."""
+        known: set[str] = set()
+        out = []
         for term in self.terms:
-            nodes, gaps = term.pair.gap_at_nodes(z)
-            positions = node_positions(term.pair.slave, nodes)
+            X = term.pair.X
+            here = {}
             for name in ("K", "L", "M"):
-                corner = np.append(corners[name], 0.0)[: positions.shape[1]]
-                near = np.linalg.norm(positions - corner, axis=1) < 1e-6 * self.case.profile.radius
-                if near.any() and name not in out:
-                    out[name] = float(gaps[near][0])
+                corner = np.append(self.case.profile.points[name], 0.0)[: X.shape[1]]
+                near = np.linalg.norm(X - corner, axis=1) < 1e-6 * self.case.profile.radius
+                if near.any() and name not in known:
+                    here[name] = int(np.argmax(near))
+            known |= here.keys()
+            out.append(here)
         return out
 
     def zones_of(self, node: int) -> str:

@@ -7,6 +7,7 @@ It adds to the residual ``G^T (w sigma_n)`` and what the law asks for, and gives
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -306,11 +307,12 @@ class IntegratedContact:
         self._radius, self._interpenetrating, self._order = radius, interpenetrating, order
         self.closed, self.caught = np.zeros(len(pair.slave.nodes), dtype=bool), 0.0
         self._expected = Expected()
-        self._known: tuple[Array, tuple[Points, Array | None, Array | None]] | None = None
+        self._is_far = _Latest(lambda z: pair.is_far(z, radius))
+        self._points = _Latest(self._find)
         self._held: Index | None = None
 
     def hold(self, z: Array | None) -> None:
-        self._held = None if z is None or self.pair.is_far(z, self._radius) else self.pair.facing(self._points(z)[0])
+        self._held = None if z is None or self._is_far(z) else self.pair.facing(self._points(z)[0])
 
     def start(self, z: Array) -> None:
         self._expected = Expected()
@@ -350,15 +352,9 @@ class IntegratedContact:
         np.logical_and.at(every, points.facet, held.all(axis=1))
         return every
 
-    def _points(self, z: Array) -> tuple[Points, Array | None, Array | None]:
-        """Contact points with the rows of the slave's own stress and their derivative, over the points' columns.
-
-        With their variation, since a residual is mostly followed by the tangent at the same z; the last are remembered.
-        """
-        if self._known is None or not np.array_equal(self._known[0], z):
-            variation = self.pair.closure != "check"
-            self._known = z.copy(), self.pair.points(z, self._order, variation, self._material, self._held)
-        return self._known[1]
+    def _find(self, z: Array) -> tuple[Points, Array | None, Array | None]:
+        """Contact points with the rows of the slave's own stress and their derivative, over the points' columns."""
+        return self.pair.points(z, self._order, self.pair.closure != "check", self._material, self._held)
 
     def _trial(self, z: Array, points: Points, S: Array | None) -> tuple[Array, Array, Array]:
         """The slave's own stress, the trial stress, and k."""
@@ -378,7 +374,7 @@ class IntegratedContact:
         return own, sc, dsc, k
 
     def add_residual(self, z: Array, R: Array) -> None:
-        if self.pair.closure == "check" or (not self._theta and self.pair.is_far(z, self._radius)):
+        if self.pair.closure == "check" or (not self._theta and self._is_far(z)):
             return
         points, S, _ = self._points(z)
         own, sc, _, k = self._law(z, points, S)
@@ -388,7 +384,7 @@ class IntegratedContact:
         np.add.at(R, points.cols, force)
 
     def tangent(self, z: Array, geometric: bool) -> Triplets:
-        if self.pair.closure == "check" or (not self._theta and self.pair.is_far(z, self._radius)):
+        if self.pair.closure == "check" or (not self._theta and self._is_far(z)):
             return _none()
         points, S, S_xi = self._points(z)
         own, sc, dsc, k = self._law(z, points, S)
@@ -429,7 +425,7 @@ class IntegratedContact:
         return _triplets(rows, points.cols, np.swapaxes(forces, 1, 2) @ np.concatenate(right, axis=1))
 
     def stiff(self, z: Array) -> tuple[Triplets, Array]:
-        if self.pair.closure == "check" or self.pair.is_far(z, self._radius):
+        if self.pair.closure == "check" or self._is_far(z):
             return _none(), np.zeros(0)
         points, S, _ = self._points(z)
         _, _, dsc, k = self._law(z, points, S)
@@ -508,11 +504,12 @@ class MortarContact:
         self.closed, self.caught = np.zeros(n, dtype=bool), 0.0
         self._settled: np.ndarray | None = None  # rows let go, where that is not left to each iterate
         self._expected = Expected()
-        self._known: tuple[Array, Points] | None = None
+        self._is_far = _Latest(lambda z: pair.is_far(z, radius))
+        self._points = _Latest(self._find)
         self._held: Index | None = None
 
     def hold(self, z: Array | None) -> None:
-        self._held = None if z is None or self.pair.is_far(z, self._radius) else self.pair.facing(self._points(z))
+        self._held = None if z is None or self._is_far(z) else self.pair.facing(self._points(z))
 
     def start(self, z: Array) -> None:
         self._expected = Expected()
@@ -542,12 +539,8 @@ class MortarContact:
             return np.zeros(len(share), dtype=bool)
         return share < self.FACING if self._settled is None else self._settled
 
-    def _points(self, z: Array) -> Points:
-        """Contact points with their variation, as those of `IntegratedContact`."""
-        if self._known is None or not np.array_equal(self._known[0], z):
-            variation = self.pair.closure != "check"
-            self._known = z.copy(), self.pair.points(z, self._order, variation, keep=self._held)[0]
-        return self._known[1]
+    def _find(self, z: Array) -> Points:
+        return self.pair.points(z, self._order, self.pair.closure != "check", keep=self._held)[0]
 
     def stiffness_norm(self) -> float:
         return float(np.linalg.norm(self._k * self._total)) if self.multipliers else 0.0
@@ -578,7 +571,7 @@ class MortarContact:
     def add_residual(self, z: Array, R: Array) -> None:
         if not self.multipliers:
             return
-        if self.pair.is_far(z, self._radius):
+        if self._is_far(z):
             R[self.at] -= self._total * z[self.at]
             return
         points = self._points(z)
@@ -591,7 +584,7 @@ class MortarContact:
     def tangent(self, z: Array, geometric: bool) -> Triplets:
         if not self.multipliers:
             return _none()
-        if self.pair.is_far(z, self._radius):
+        if self._is_far(z):
             return self.at, self.at, -self._total
         points = self._points(z)
         _, dsc, w = self._law(z, points)
@@ -651,7 +644,7 @@ class MortarContact:
 
     def stiff(self, z: Array) -> tuple[Triplets, Array]:
         kappa = self._k / self._total
-        if not self.multipliers or self.pair.is_far(z, self._radius):
+        if not self.multipliers or self._is_far(z):
             return _none(), kappa[: self.multipliers]
         points = self._points(z)
         _, dsc, w = self._law(z, points)
@@ -682,6 +675,19 @@ class MortarContact:
             nearest = np.argmax(self.pair.hats(points)[0], axis=-1)
             closed = np.take_along_axis(dsc[self._ends[points.facet]], nearest, axis=1) > 0
         return self.pair.report(z, points, stress, closed)
+
+
+class _Latest[T]:
+    """A function of z that remembers its last value: a residual is mostly followed by the tangent at the same z."""
+
+    def __init__(self, function: Callable[[Array], T]) -> None:
+        self._function = function
+        self._last: tuple[Array, T] | None = None
+
+    def __call__(self, z: Array) -> T:
+        if self._last is None or not np.array_equal(self._last[0], z):
+            self._last = z.copy(), self._function(z)
+        return self._last[1]
 
 
 def _farthest(gap: Array, of: np.ndarray) -> float:

@@ -186,7 +186,7 @@ def test_checked_contact_reports_and_does_nothing(method: str, order: int) -> No
     assert_allclose(state.gap, -0.1)
     assert_allclose(state.pressure, 0)
     assert state.closed.all()
-    assert_allclose(term.pair.gap_at_nodes(z)[1], -0.1)
+    assert_allclose(term.pair.at_nodes(z).gap, -0.1)
 
 
 @pytest.mark.parametrize(

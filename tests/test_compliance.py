@@ -1,0 +1,91 @@
+"""Blocks of low rank are the matrix that they stand for, in less memory."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse
+from numpy.testing import assert_allclose
+
+from extrusion.compliance import FORCES, WHOLE, Block, Blocks, Compliance
+from extrusion.gap import Array, Index
+
+N, READ = 1000, 2600
+
+
+def smooth() -> tuple[Array, Index]:
+    """What forces on half a plane do: -log of the distance; and where each force's own displacement is read."""
+    own = np.sort(np.random.default_rng(1).choice(READ // 2, N // 2, replace=False))
+    own = np.stack([2 * own, 2 * own + 1], axis=1).ravel()  # two forces a node
+    x = np.arange(READ) // 2
+    return -np.log(np.abs(x[own][:, None] - x) + 0.5) * (1 + 0.1 * (np.arange(READ) % 2)), own
+
+
+def made(C: Array, own: Index, single: bool = False, of: slice = slice(None)) -> Compliance:
+    """In blocks, those of some forces."""
+    compliance = Compliance(own, own // 2, C.shape[1], single)
+    for number in compliance.missing(np.arange(len(own))[of]):
+        compliance.make(number, C[compliance.blocks[number]])
+    return compliance
+
+
+def test_displacements() -> None:
+    """A far part at the wrong columns, a rank too low, forces whose rows have not been made."""
+    C, own = smooth()
+    f = np.random.default_rng(2).standard_normal(N)
+    compliance = made(C, own)
+    assert len(compliance.blocks) == 8
+    assert all(own[rows.start] // 2 != own[rows.start - 1] // 2 for rows in compliance.blocks[1:])
+    assert_allclose(compliance.displacements(f), f @ C, rtol=0, atol=1e-12 * np.abs(C).max() * np.abs(f).sum())
+    assert compliance.nbytes < 0.45 * C.nbytes
+    some = made(C, own, of=slice(0, 300))
+    assert some.made == some.blocks[2].stop < N
+    assert_allclose(some.displacements(f), f[: some.made] @ C[: some.made], atol=1e-8)
+    assert some.missing(np.array([10, 290, 700, 701])) == [5]
+
+
+def test_what_is_not_smooth_stays() -> None:
+    """Nothing of a matrix without low rank is lost, and a small one is one block."""
+    C = np.random.default_rng(3).standard_normal((N, READ))
+    f = np.ones(N)
+    compliance = made(C, smooth()[1])
+    assert compliance.nbytes == C.nbytes
+    assert_allclose(compliance.displacements(f), f @ C, atol=1e-10)
+    assert len(Compliance(np.arange(WHOLE), np.arange(WHOLE), 900, False).blocks) == 1
+    assert Compliance(np.zeros(0, dtype=int), np.zeros(0, dtype=int), 0, False).displacements(np.zeros(0)).shape == (0,)
+
+
+@pytest.mark.parametrize("columns", [slice(0, READ), slice(900, 1400), slice(0, 300), slice(2300, READ)])
+@pytest.mark.parametrize("single", [False, True])
+def test_parts(columns: slice, single: bool) -> None:
+    """Rows of kept forces with what follows them, and of followers, over some columns: also none of a block's own."""
+    C, own = smooth()
+    compliance = made(C, own, single, slice(200, 700))
+    at = np.arange(compliance.blocks[1].start + 4, compliance.blocks[5].stop - 40, 2)
+    kept, others = at, at[at % 3 > 0] + 1  # of every node its first force, of some the second
+    slope = np.linspace(0.5, 2.0, len(others))
+    two = np.searchsorted(kept, others - 1)
+    dtype: Any = np.float32 if single else np.float64
+    E = scipy.sparse.csr_array((slope.astype(dtype), (two, np.arange(len(others)))), shape=(len(kept), len(others)))
+    w, h = (np.random.default_rng(4).standard_normal(len(rows)) for rows in (kept, others))
+    found = list(compliance.parts(kept, others, E, columns))
+    accuracy = 1e-5 if single else 1e-11
+    for vector, rows, blocks in (
+        (w, C[kept] + E @ C[others], [(k, 3, block) for k, _, block, _ in found]),
+        (h, C[others], [(o, 3, block) for _, o, _, block in found]),
+    ):
+        out = np.zeros(3 + columns.stop - columns.start, dtype=dtype)
+        Blocks(blocks).add(vector.astype(dtype), out)
+        expected = vector @ rows[:, columns]
+        assert_allclose(out[3:], expected, atol=accuracy * np.abs(C).max() * len(vector))
+        assert_allclose(np.concatenate([b.whole() for _, _, b in blocks]), rows[:, columns], atol=accuracy * 10)
+
+
+def test_a_block_is_as_wide_as_its_forces() -> None:
+    """Of the columns, those around the forces stay as they are."""
+    rows, near = smooth()[0][:FORCES], slice(0, 400)
+    (block,) = Block.of(rows, near, [np.float64])
+    assert block.near == near
+    assert block.D.shape == (FORCES, 400)
+    assert 5 < block.U.shape[1] < 48
+    assert_allclose(block.whole(), rows, atol=1e-12)
