@@ -87,7 +87,7 @@ class Outcome:
     base: float = math.nan  # MB, before
     memory_factor: float = math.nan  # MB, peak until the bulk is factored
     memory: float = math.nan  # MB, peak
-    compliance: float = math.nan  # MB, with all of its columns
+    compliance: float = math.nan  # MB
     K_error: float = math.nan  # largest over the reference's t
     K_bar: float = math.nan
     reaction_error: float = math.nan  # the same, of max(7.8e5 N, its size)

@@ -2,6 +2,12 @@
 #include <math.h>
 #include <string.h>
 
+enum
+{
+  none = -1,
+  turning = -2
+};
+
 static const double two_pi = 6.283185307179586476925286766559;
 
 /* Lagrange functions of a facet with nodes start, end(, middle), or their first or second derivative. */
@@ -42,6 +48,16 @@ static double root(int64_t k, const double* x, double target)
   double q = -0.5 * (b + copysign(sqrt(square > 0 ? square : 0), b));
   double one = c / q, other = q / a;
   return fabs(one - 0.5) <= fabs(other - 0.5) ? one : other;
+}
+
+/* Where a facet turns back along the base line, or 1 if it does not. */
+static double turn(int64_t k, const double* x)
+{
+  if (k == 2)
+    return 1;
+  double a = 2 * x[0] + 2 * x[2] - 4 * x[4], b = -3 * x[0] - x[2] + 4 * x[4];
+  double at = a == 0 ? 1 : -b / (2 * a);
+  return at > 1e-9 && at < 1 - 1e-9 ? at : 1;
 }
 
 static void place(const surface* of, int64_t facet, const double* z, double* x)
@@ -104,115 +120,138 @@ int64_t ray_points(const surface* slave, const surface* die, const double* z, in
     for (int64_t i = 0; i < 2 * k; ++i)
       if (!isfinite(x[i]))
         return -1;
-    const int forward = x[p] <= x[2 + p]; /* a facet that has turned over passes the vertices backwards */
-    const int64_t low = below(vertex, m + 1, fmin(x[p], x[2 + p]) + resting, 1);
-    const int64_t high = below(vertex, m + 1, fmax(x[p], x[2 + p]) - resting, 0);
-    const int64_t pieces = (high > low ? high - low : 0) + 1;
-    if (!out)
-    {
-      n += pieces;
-      continue;
-    }
     const double start = slave->X[2 * k * facet], t = slave->X[2 * k * facet + 2] - start;
     const double length = slave->length[facet];
     const int64_t* local = slave->local + k * facet;
-    double xi0 = 0, N0[3], speed0 = 1; /* the piece's beginning, and what moves it */
-    int64_t v0 = -1;
-    for (int64_t nth = 0; nth < pieces; ++nth, ++n)
+    const double turns = turn(k, x + p); /* a facet crushed at the billet's edge: then its parts one after the other */
+    double xi0 = 0, N0[3], speed0 = 1;   /* the piece's beginning, and what moves it: */
+    int64_t v0 = none;                   /* a vertex, or the facet's own turning */
+    for (int part = 0; part < (turns < 1 ? 2 : 1); ++part)
     {
-      const int64_t opposite = (forward ? low : high) - 1 + (forward ? nth : -nth);
-      const int after = opposite >= m, outside = after || opposite < 0;
-      const int64_t e = opposite < 0 ? 0 : after ? m - 1 : opposite;
-      place(die, e, z, xd);
-      double xi1 = 1, N1[3] = {0}, speed1 = 1, at[2];
-      int64_t v1 = -1;
-      if (nth + 1 < pieces)
+      double ends[2] = {x[p], x[2 + p]}, end = part || turns == 1 ? 1 : turns;
+      if (turns < 1)
       {
-        v1 = forward ? opposite + 1 : opposite;
-        xi1 = root(k, x + p, vertex[v1]);
-        shape(k, 0, xi1, N1);
-        double dN[3];
-        shape(k, 1, xi1, dN);
-        sum(k, dN, x, at);
-        speed1 = at[p];
+        double N[3], at[2];
+        shape(k, 0, turns, N);
+        sum(k, N, x, at);
+        ends[1 - part] = at[p];
       }
-      out->facet[n] = facet;
-      out->die[n] = e;
-      int64_t* cols = out->cols + L * n;
-      for (int64_t i = 0; i < K + kd; ++i)
+      const int forward = ends[0] <= ends[1]; /* what has turned over passes the vertices backwards */
+      const int64_t low = below(vertex, m + 1, fmin(ends[0], ends[1]) + resting, 1);
+      const int64_t high = below(vertex, m + 1, fmax(ends[0], ends[1]) - resting, 0);
+      const int64_t pieces = (high > low ? high - low : 0) + 1;
+      if (!out)
       {
-        const int64_t node = i < K ? slave->cells[K * facet + i] : die->nodes[kd * e + i - K];
-        cols[2 * i] = 2 * node;
-        cols[2 * i + 1] = 2 * node + 1;
+        n += pieces;
+        continue;
       }
-      const double width = xi1 - xi0;
-      const double* Xd = die->X + 2 * kd * e;
-      const double reference = (Xd[2 + c] - Xd[c]) / (Xd[2 + p] - Xd[p]);
-      for (int i = 0; i < q; ++i)
+      for (int64_t nth = 0; nth < pieces; ++nth, ++n)
       {
-        const int64_t at_point = q * n + i, row = L * at_point;
-        double N[3], dN[3], M[3], dM[3], ddM[3], xs[2], dxs[2], y[2], dy[2], ddy[2];
-        const double xi = xi0 + width * s[i];
-        shape(k, 0, xi, N);
-        shape(k, 1, xi, dN);
-        sum(k, N, x, xs);
-        sum(k, dN, x, dxs);
-        const double on = outside ? after : root(kd, xd + p, xs[p]);
-        shape(kd, 0, on, M);
-        shape(kd, 1, on, dM);
-        shape(kd, 2, on, ddM);
-        sum(kd, M, xd, y);
-        sum(kd, dM, xd, dy);
-        sum(kd, ddM, xd, ddy);
-        const double slope = outside ? reference : dy[c] / dy[p];
-        const double jacobian = axisymmetric ? two_pi * (start + xi * t) * length : length;
-        out->xi[at_point] = xi;
-        out->weight[at_point] = width * omega[i] * jacobian;
-        out->slope[at_point] = slope;
-        out->past[at_point] = outside;
-        out->gap[at_point] = sign * (y[c] + (outside ? slope * (xs[p] - y[p]) : 0) - xs[c]);
-        /* second variation at fixed xi; right is half of kappa a more, so that l (x) r = a (x) b + b (x) a */
-        out->gap_xi[at_point] = sign * (slope * dxs[p] - dxs[c]);
-        const double kappa = outside ? 0 : (ddy[c] - slope * ddy[p]) / (dy[p] * dy[p]);
-        double* rows[6] = {out->G, out->G_xi, out->left, out->right, out->dxi, out->dweight};
-        for (int j = 0; j < 6; ++j)
+        const int64_t opposite = (forward ? low : high) - 1 + (forward ? nth : -nth);
+        const int after = opposite >= m, outside = after || opposite < 0;
+        const int64_t e = opposite < 0 ? 0 : after ? m - 1 : opposite;
+        place(die, e, z, xd);
+        double xi1 = end, N1[3] = {0}, speed1 = 1, at[2];
+        int64_t v1 = none;
+        if (nth + 1 < pieces)
         {
-          rows[j] += row;
-          memset(rows[j], 0, L * sizeof(double));
+          v1 = forward ? opposite + 1 : opposite;
+          xi1 = root(k, x + p, vertex[v1]);
+          if (turns < 1 && (xi1 > turns) != part) /* the root as far on the other side */
+            xi1 = 2 * turns - xi1;
+          shape(k, 0, xi1, N1);
+          double dN[3];
+          shape(k, 1, xi1, dN);
+          sum(k, dN, x, at);
+          speed1 = at[p];
         }
-        for (int64_t j = 0; j < k + kd; ++j)
+        else if (turns < 1 && !part)
         {
-          const int64_t col = 2 * (j < k ? local[j] : K + j - k);
-          const double weight = j < k ? -N[j] : M[j - k], turning = j < k || outside ? 0 : dM[j - k] / dy[p];
-          rows[0][col + c] = sign * weight;
-          rows[0][col + p] = -slope * sign * weight;
-          rows[1][col + c] = sign * (j < k ? -dN[j] : dxs[p] * turning);
-          rows[1][col + p] = -slope * rows[1][col + c] - sign * dxs[p] * kappa * weight;
-          rows[2][col + p] = -weight;
-          rows[3][col + c] = sign * turning;
-          rows[3][col + p] = -0.5 * sign * kappa * weight - slope * rows[3][col + c];
+          v1 = turning;
+          shape(k, 1, turns, N1);
+          double ddN[3];
+          shape(k, 2, turns, ddN);
+          sum(k, ddN, x, at);
+          speed1 = at[p];
         }
-        /* the split points move, with them the points and weights that they carry */
-        for (int end = 0; end < 2; ++end)
+        out->facet[n] = facet;
+        out->die[n] = e;
+        int64_t* cols = out->cols + L * n;
+        for (int64_t i = 0; i < K + kd; ++i)
         {
-          const int64_t v = end ? v1 : v0;
-          if (v < 0)
-            continue;
-          const double share = end ? s[i] : 1 - s[i], wider = (end ? 1 : -1) * omega[i] * jacobian;
-          const double *shapes = end ? N1 : N0, speed = end ? speed1 : speed0;
-          for (int64_t j = 0; j <= k; ++j)
+          const int64_t node = i < K ? slave->cells[K * facet + i] : die->nodes[kd * e + i - K];
+          cols[2 * i] = 2 * node;
+          cols[2 * i + 1] = 2 * node + 1;
+        }
+        const double width = xi1 - xi0;
+        const double* Xd = die->X + 2 * kd * e;
+        const double reference = (Xd[2 + c] - Xd[c]) / (Xd[2 + p] - Xd[p]);
+        for (int i = 0; i < q; ++i)
+        {
+          const int64_t at_point = q * n + i, row = L * at_point;
+          double N[3], dN[3], M[3], dM[3], ddM[3], xs[2], dxs[2], y[2], dy[2], ddy[2];
+          const double xi = xi0 + width * s[i];
+          shape(k, 0, xi, N);
+          shape(k, 1, xi, dN);
+          sum(k, N, x, xs);
+          sum(k, dN, x, dxs);
+          const double on = outside ? after : root(kd, xd + p, xs[p]);
+          shape(kd, 0, on, M);
+          shape(kd, 1, on, dM);
+          shape(kd, 2, on, ddM);
+          sum(kd, M, xd, y);
+          sum(kd, dM, xd, dy);
+          sum(kd, ddM, xd, ddy);
+          const double slope = outside ? reference : dy[c] / dy[p];
+          const double jacobian = axisymmetric ? two_pi * (start + xi * t) * length : length;
+          out->xi[at_point] = xi;
+          out->weight[at_point] = width * omega[i] * jacobian;
+          out->slope[at_point] = slope;
+          out->past[at_point] = outside;
+          out->gap[at_point] = sign * (y[c] + (outside ? slope * (xs[p] - y[p]) : 0) - xs[c]);
+          /* second variation at fixed xi; right is half of kappa a more, so that l (x) r = a (x) b + b (x) a */
+          out->gap_xi[at_point] = sign * (slope * dxs[p] - dxs[c]);
+          const double kappa = outside ? 0 : (ddy[c] - slope * ddy[p]) / (dy[p] * dy[p]);
+          double* rows[6] = {out->G, out->G_xi, out->left, out->right, out->dxi, out->dweight};
+          for (int j = 0; j < 6; ++j)
           {
-            const int64_t col = 2 * (j < k ? local[j] : K + (v > e)) + p;
-            const double cut = (j < k ? -shapes[j] : 1) / speed;
-            rows[4][col] += share * cut;
-            rows[5][col] += wider * cut + (axisymmetric ? two_pi * width * omega[i] * t * length * share * cut : 0);
+            rows[j] += row;
+            memset(rows[j], 0, L * sizeof(double));
+          }
+          for (int64_t j = 0; j < k + kd; ++j)
+          {
+            const int64_t col = 2 * (j < k ? local[j] : K + j - k);
+            const double weight = j < k ? -N[j] : M[j - k], turning = j < k || outside ? 0 : dM[j - k] / dy[p];
+            rows[0][col + c] = sign * weight;
+            rows[0][col + p] = -slope * sign * weight;
+            rows[1][col + c] = sign * (j < k ? -dN[j] : dxs[p] * turning);
+            rows[1][col + p] = -slope * rows[1][col + c] - sign * dxs[p] * kappa * weight;
+            rows[2][col + p] = -weight;
+            rows[3][col + c] = sign * turning;
+            rows[3][col + p] = -0.5 * sign * kappa * weight - slope * rows[3][col + c];
+          }
+          /* the split points move, with them the points and weights that they carry */
+          for (int last = 0; last < 2; ++last)
+          {
+            const int64_t v = last ? v1 : v0;
+            if (v == none)
+              continue;
+            const double share = last ? s[i] : 1 - s[i], wider = (last ? 1 : -1) * omega[i] * jacobian;
+            const double *shapes = last ? N1 : N0, speed = last ? speed1 : speed0;
+            for (int64_t j = 0; j < k + (v >= 0); ++j)
+            {
+              const int64_t col = 2 * (j < k ? local[j] : K + (v > e)) + p;
+              const double cut = (j < k ? -shapes[j] : 1) / speed;
+              rows[4][col] += share * cut;
+              rows[5][col] += wider * cut + (axisymmetric ? two_pi * width * omega[i] * t * length * share * cut : 0);
+            }
           }
         }
+        xi0 = xi1;
+        v0 = v1;
+        speed0 = speed1;
+        memcpy(N0, N1, sizeof N0);
       }
-      xi0 = xi1;
-      v0 = v1;
-      speed0 = speed1;
-      memcpy(N0, N1, sizeof N0);
     }
   }
   return n;
