@@ -39,6 +39,9 @@ AT_MOST = 1
 SETTLE = 3
 """Passes after which a node that rests on a die vertex stays with the facet it had."""
 
+DAMP = 8
+"""Passes after which billet and die are paired halfway between the last two solutions."""
+
 PASS_TOLERANCE = 0.01
 """Passes stop when the displacement increment changes by less than this part of itself (the sheet's RESI_GEOM)."""
 
@@ -171,7 +174,8 @@ def _increment(problem: System, newton: Newton, accepted: PETSc.Vec, ahead: floa
     # while the pairing still changes much, few iterations are as good as many: worth it where they are dear
     rough = frozen and problem.case.space == "3d"
     for attempt in range(1, PASSES + 1):
-        problem.pair_up(x, settle=attempt > (SETTLE if frozen else 1))
+        settle, damp = attempt > (SETTLE if frozen else 1), frozen and attempt > DAMP
+        problem.pair_up(x, settle, previous if damp else None)
         x.copy(previous)
         rough &= attempt <= ROUGH
         outcome = newton.solve(x, AT_MOST if rough else None, 0.0 if frozen and attempt > 1 else ahead)

@@ -122,12 +122,13 @@ class System(ABC):
         for term in self.terms:
             term.start(z)
 
-    def pair_up(self, x: PETSc.Vec, settle: bool = False) -> None:
-        """Pair billet and die anew at x, for terms that freeze their pairing."""
+    def pair_up(self, x: PETSc.Vec, settle: bool = False, before: PETSc.Vec | None = None) -> None:
+        """Pair billet and die anew at x, for terms that freeze their pairing (`ContactTerm.pair_up`)."""
         z = self.gather(x)
+        earlier = None if before is None else self.gather(before)
         with self._pairs():
             for term in self.terms:
-                term.pair_up(z, settle)
+                term.pair_up(z, settle, earlier)
 
     @property
     def may_settle(self) -> bool:

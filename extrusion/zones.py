@@ -33,10 +33,11 @@ class ContactTerm(Protocol):
     def start(self, z: Array) -> None:
         """Set the accepted state at t = 0 from the gap there."""
 
-    def pair_up(self, z: Array, settle: bool = False) -> None:
+    def pair_up(self, z: Array, settle: bool = False, before: Array | None = None) -> None:
         """Freeze what the term freezes of the geometry (nothing, for terms that follow it).
 
-        ``settle``: let points that rest on a die vertex stay with the facet they had.
+        ``settle``: let points that rest on a die vertex stay with the facet they had, or between two; ``before``: pair
+        halfway between z and this.
         """
 
     def settled(self, z: Array) -> bool:
@@ -159,6 +160,64 @@ class Expected:
         return np.where(closed, trial, 0.0), closed.astype(float)
 
 
+@dataclass(frozen=True)
+class _Frozen:
+    """A pairing of nodes: the gap and its derivative, linear in z."""
+
+    facet: Index
+    cols: Index  # (n, L)
+    G: Array  # (n, L)
+    g0: Array  # (n,) mm
+    z: Array  # where it was made: the solution with the pairing before
+
+    def gap(self, z: Array, which: Index | slice = slice(None)) -> Array:
+        """Of all nodes, or of some, mm."""
+        return np.asarray(self.g0[which] + np.einsum("nl,nl->n", self.G[which], z[self.cols[which]]))
+
+
+class _Resting:
+    """Nodes at a vertex of the die that either facet there would push over to the other one.
+
+    What keeps such a node at the vertex is a force between the facets' normals: it takes both facets' rows, in a
+    proportion that is found pass by pass, by false position.
+
+    Args:
+        node: The nodes.
+        first: The pairing with one facet.
+        second: That with the other, made at the solution with the first.
+        z: The solution with the second.
+    """
+
+    def __init__(self, node: Index, first: _Frozen, second: _Frozen, z: Array) -> None:
+        # the gaps' difference vanishes at the vertex, and has a sign for either side of it
+        ends = np.array([second.gap(at, node) - first.gap(at, node) for at in (second.z, z)])
+        between = ends[0] * ends[1] < 0.0
+        self.node = node[between]
+        self._both = [(of.cols[self.node], of.G[self.node], of.g0[self.node]) for of in (first, second)]
+        self._share, self._off = np.zeros((2, len(self.node))), ends[:, between]
+        self._share[1] = 1.0
+
+    def tell(self, z: Array) -> None:
+        """Take a solution with the rows."""
+        gap = [g0 + np.einsum("nl,nl->n", G, z[cols]) for cols, G, g0 in self._both]
+        off = gap[1] - gap[0]
+        end = np.where(off * self._off[0] > 0, 0, 1), np.arange(len(off))
+        self._share[end], self._off[end] = self.share, off
+
+    @property
+    def share(self) -> Array:
+        """Part of the second facet."""
+        (a, b), (u, v) = self._share, self._off
+        return np.asarray(a + (b - a) * u / (u - v))
+
+    def rows(self) -> tuple[Index, Array, Array]:
+        """Columns, derivative and gap at z = 0."""
+        (cols, G, g0), (more_cols, more_G, more_g0) = self._both
+        part = self.share
+        both = np.concatenate([(1 - part)[:, None] * G, part[:, None] * more_G], axis=1)
+        return np.concatenate([cols, more_cols], axis=1), both, (1 - part) * g0 + part * more_g0
+
+
 class NodalContact:
     """Exact constraint at the slave nodes by an active set, one multiplier (N, whole revolution) a node.
 
@@ -167,6 +226,8 @@ class NodalContact:
     Kunisch 2002, doi:10.1137/S1052623401383558)::
 
         trial = lambda + kappa g;  residual  K u - f + G^T lambda,  min(trial, 0) - lambda
+
+    A node that flips between two facets of the die rests on the vertex between them (`_Resting`).
     """
 
     def __init__(self, pair: Pair, first: int, stiffness: Array, radius: float, interpenetrating: bool = False) -> None:
@@ -178,7 +239,8 @@ class NodalContact:
         self._kappa = np.full(len(self.nodes), float(np.mean(stiffness) * np.mean(np.abs(self.weight))))
         self._radius, self._interpenetrating = radius, interpenetrating
         self.closed, self.caught = np.zeros(len(self.nodes), dtype=bool), 0.0
-        self._facet: Index | None = None
+        self._pairings: list[_Frozen] = []  # the last, and the one before
+        self._resting: list[_Resting] = []
         self._last: np.ndarray | None = None  # nodes that the last pairing's solve left closed
         self._expects = False
 
@@ -188,12 +250,36 @@ class NodalContact:
         self.closed = closed_at_start(gap, self._radius, self._interpenetrating)
         self.caught = _farthest(gap, self.closed)
 
-    def pair_up(self, z: Array, settle: bool = False) -> None:
-        self._last = self._law(z)[2] > 0 if self.multipliers and self._facet is not None else None
-        found = self.pair.at_nodes(z, self._facet if settle else None)
-        self._G, self._cols, self._past, self._cos = found.G, found.cols, found.past, found.cos
-        self._facet = found.facet
-        self._g0 = found.gap - self._apply(z)
+    def pair_up(self, z: Array, settle: bool = False, before: Array | None = None) -> None:
+        self._last = self._law(z)[2] > 0 if self.multipliers and self._pairings else None
+        at = z if before is None else (z + before) / 2
+        found = self.pair.at_nodes(at, self._pairings[-1].facet if settle else None)
+        self._past, self._cos = found.past, found.cos
+        self._G, self._cols = found.G, found.cols
+        self._g0 = found.gap - self._apply(at)
+        now = _Frozen(found.facet, found.cols, found.G, self._g0, z.copy())
+        if settle:
+            self._rest(now, z)
+        else:
+            self._resting = []
+        self._pairings = [*self._pairings[-1:], now]
+
+    def _rest(self, now: _Frozen, z: Array) -> None:
+        """Keep nodes at their vertex that have flipped back and forth."""
+        for resting in self._resting:
+            resting.tell(z)
+        if len(self._pairings) == 2:
+            first, second = self._pairings
+            flips = (now.facet == first.facet) & (now.facet != second.facet)
+            for resting in self._resting:
+                flips[resting.node] = False
+            new = _Resting(np.flatnonzero(flips), first, second, z)
+            self._resting += [new] if len(new.node) else []
+        if self._resting:
+            self._G = np.concatenate([self._G, np.zeros_like(self._G)], axis=1)
+            self._cols, self._g0 = np.concatenate([self._cols, self._cols], axis=1), self._g0.copy()
+        for resting in self._resting:
+            self._cols[resting.node], self._G[resting.node], self._g0[resting.node] = resting.rows()
 
     def settled(self, z: Array) -> bool:
         return True
@@ -321,7 +407,7 @@ class IntegratedContact:
         self.closed = self._whole_facets(points, held)
         self.caught = _farthest(points.gap, self.closed[points.facet])
 
-    def pair_up(self, z: Array, settle: bool = False) -> None:
+    def pair_up(self, z: Array, settle: bool = False, before: Array | None = None) -> None:
         pass
 
     def settled(self, z: Array) -> bool:
@@ -520,7 +606,7 @@ class MortarContact:
         np.logical_and.at(self.closed, ends, held.all(axis=1)[:, None])
         self.caught = _farthest(points.gap, self.closed[ends].all(axis=1))
 
-    def pair_up(self, z: Array, settle: bool = False) -> None:
+    def pair_up(self, z: Array, settle: bool = False, before: Array | None = None) -> None:
         if not settle or self.pair.extended:
             self._settled = None
             return

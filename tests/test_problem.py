@@ -23,7 +23,7 @@ from extrusion.mesh import PlainMesh, case_mesh
 from extrusion.newton import WATCH, Newton, Outcome
 from extrusion.problem import Problem
 from extrusion.stepping import Step, steps
-from extrusion.zones import ContactState
+from extrusion.zones import ContactState, NodalContact
 
 LAWS: dict[str, dict[str, Any]] = {
     "nodal": {"method": "nodal"},
@@ -260,6 +260,24 @@ def test_complementarity(order: int, die: str) -> None:
             assert np.max(np.abs(state.pressure * state.gap)[on]) < 1e-6  # N/mm
             opened, closed = opened + np.sum(state.gap[on] > 1e-3), closed + np.sum(state.pressure[on] > 1)
     assert min(opened, closed) > 100
+
+
+@pytest.mark.parametrize(("size", "order", "until"), [(4.0, 1, 30.0), (2.0, 2, 60.0)])
+def test_nodes_that_rest_on_a_vertex_of_the_die(size: float, order: int, until: float) -> None:
+    """They do not flip between its facets until the increment is cut to nothing, nor do they overlap either."""
+    case = replace(A, size=size, order=order).with_increment(5.0, until)
+    problem = Problem(case, case_mesh(case.profile, size), MPI.COMM_SELF)
+    resting = 0
+    for step in steps(problem, Newton(problem), case.times()):
+        assert step.cuts == 0
+        z = problem.gather(problem.x)
+        for term in problem.terms:
+            assert isinstance(term, NodalContact)
+            assert np.min(term.pair.at_nodes(z).gap) > -5e-3  # by the facets as they are now
+            for some in term._resting:
+                resting += len(some.node)
+                assert np.all((some.share > 0) & (some.share < 1))
+    assert resting > 0
 
 
 def test_checked_contact_reports_the_overlap() -> None:

@@ -340,6 +340,16 @@ def test_two_ranks_are_one(name: str, surface: bool) -> None:
     assert_allclose(ends[0], ends[1], rtol=0, atol=1e-8)
 
 
+def test_raw_normals() -> None:
+    """Nodes that rest on the die's meridians, where raw normals change, do not flip between the facets there."""
+    raw = tuple(replace(zone, smooth=False) for zone in cases.B.zones)
+    case = replace(cases.B, zones=raw).with_increment(until=20.0)
+    problem = in_space(case, size=10.0)
+    found = list(steps(problem, Newton(problem), case.times()))
+    assert [step.cuts for step in found] == [0, 0, 0]
+    assert found[-1].points["K"][1] == pytest.approx(20.7, abs=0.1)
+
+
 # -- the same in axisymmetry -----------------------------------------------------------------------------------
 
 TAPER = straight_die(radius=10, length=20, bore=(10, 9), stop=50)
