@@ -1,4 +1,4 @@
-/* Rows of a matrix by a vector, block by block: see `extrusion/compliance.py`. */
+/* Rows of a matrix by a vector, block by block, and sparse matrices from triplets: see `extrusion/compliance.py`. */
 #include <string.h>
 
 enum
@@ -43,3 +43,42 @@ enum
 
 ADD(double)
 ADD(float)
+
+#define CSR(real)                                                                                                      \
+  int64_t csr_##real(int64_t count, const int32_t* row, const int32_t* column, const double* value, int64_t rows,      \
+                     int64_t width, int32_t* start, int32_t* columns, real* values, int32_t* scratch)                  \
+  {                                                                                                                    \
+    int32_t *order = scratch, *next = order + count, *at = next + rows, n = 0, last = 0;                               \
+    memset(start, 0, (rows + 1) * sizeof *start);                                                                      \
+    for (int64_t i = 0; i < count; ++i)                                                                                \
+      if (row[i] >= 0 && column[i] >= 0)                                                                               \
+        ++start[row[i] + 1];                                                                                           \
+    for (int64_t r = 0; r < rows; ++r)                                                                                 \
+      next[r] = start[r + 1] += start[r];                                                                              \
+    for (int64_t i = count; i-- > 0;)                                                                                  \
+      if (row[i] >= 0 && column[i] >= 0)                                                                               \
+        order[--next[row[i]]] = i;                                                                                     \
+    memset(at, 0xff, width * sizeof *at);                                                                              \
+    for (int64_t r = 0; r < rows; ++r)                                                                                 \
+    {                                                                                                                  \
+      const int32_t end = start[r + 1];                                                                                \
+      start[r] = n;                                                                                                    \
+      for (; last < end; ++last)                                                                                       \
+      {                                                                                                                \
+        const int32_t c = column[order[last]];                                                                         \
+        if (at[c] < start[r])                                                                                          \
+        {                                                                                                              \
+          at[c] = n;                                                                                                   \
+          columns[n] = c;                                                                                              \
+          values[n++] = value[order[last]];                                                                            \
+        }                                                                                                              \
+        else                                                                                                           \
+          values[at[c]] += value[order[last]];                                                                         \
+      }                                                                                                                \
+    }                                                                                                                  \
+    start[rows] = n;                                                                                                   \
+    return n;                                                                                                          \
+  }
+
+CSR(double)
+CSR(float)

@@ -1,4 +1,4 @@
-/* Rows of a matrix by a vector: see `extrusion/compliance.py`. */
+/* Rows of a matrix by a vector, and sparse matrices from triplets: see `extrusion/compliance.py`. */
 
 typedef struct
 {
@@ -12,3 +12,12 @@ typedef struct
 /* out += sum over blocks of vector . rows, in double and in single precision. */
 void add_double(int64_t count, const block* blocks, const double* vector, double* out);
 void add_float(int64_t count, const block* blocks, const float* vector, float* out);
+
+/* Compressed rows from triplets: those with a negative row or column are left out, equal places are added up, and the
+ * columns of a row are in the order in which they come. The number of entries.
+ *
+ * start: (rows + 1). columns, values: (count). scratch: (count + rows + width). */
+int64_t csr_double(int64_t count, const int32_t* row, const int32_t* column, const double* value, int64_t rows,
+                   int64_t width, int32_t* start, int32_t* columns, double* values, int32_t* scratch);
+int64_t csr_float(int64_t count, const int32_t* row, const int32_t* column, const double* value, int64_t rows,
+                  int64_t width, int32_t* start, int32_t* columns, float* values, int32_t* scratch);

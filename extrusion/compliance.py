@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 
 from extrusion.compiled import blocks
 from extrusion.gap import Array, Index
@@ -128,6 +129,20 @@ class Blocks:
         if self._parts:
             assert f.dtype == out.dtype == self._dtype
             self._add(len(self._parts), self._blocks, self._of(self._kind, f), self._of(self._kind, out))
+
+
+def assembled(rows: Index, cols: Index, values: Array, shape: tuple[int, int], dtype: Any) -> Any:
+    """A sparse matrix by rows from triplets; those with a negative row or column are left out."""
+    ffi, lib = blocks().ffi, blocks().lib
+    real, add = ("float[]", lib.csr_float) if dtype == np.float32 else ("double[]", lib.csr_double)
+    count = len(values)
+    start, columns, out = np.empty(shape[0] + 1, np.int32), np.empty(count, np.int32), np.empty(count, dtype)
+    scratch = np.empty(count + sum(shape), np.int32)
+    integers = (ffi.from_buffer("int32_t[]", array) for array in (rows, cols, start, columns, scratch))
+    row, column, to_start, to_columns, to_scratch = integers
+    given = row, column, ffi.from_buffer("double[]", values), *shape
+    n = add(count, *given, to_start, to_columns, ffi.from_buffer(real, out), to_scratch)
+    return scipy.sparse.csr_array((out[:n], columns[:n], start), shape=shape)
 
 
 def _product(A: Array, largest: float) -> tuple[Array, Array, Array]:

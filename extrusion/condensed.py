@@ -35,7 +35,7 @@ import scipy.sparse
 
 from dolfinx.fem.petsc import get_petsc_lib
 
-from extrusion.compliance import Blocks, Compliance
+from extrusion.compliance import Blocks, Compliance, assembled
 from extrusion.errors import InputError
 from extrusion.gap import Array, Index
 from extrusion.problem import BILLET_POINTS, Problem
@@ -632,11 +632,9 @@ class _Tangent:
         if D is None:
             return
         self._hold(D)
-        r, c, values = self._row[D.rows], self._col[D.cols], D.values.astype(self._dtype)
-        if system.n_multipliers:  # those that are not pressed have no row
-            on = np.flatnonzero((r >= 0) & (c >= 0))
-            r, c, values = r[on], c[on], values[on]
-        self._D = scipy.sparse.coo_array((values, (r, c)), shape=(len(self._entries), len(self._cols))).tocsr()
+        # multipliers that are not pressed have no row
+        shape = len(self._entries), len(self._cols)
+        self._D = assembled(self._row[D.rows], self._col[D.cols], D.values, shape, self._dtype)
         self._fresh = self._lu is None
         if self._lu is None:
             self._factor(self.PARALLEL)

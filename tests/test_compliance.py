@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse
 from numpy.testing import assert_allclose
 
-from extrusion.compliance import FORCES, WHOLE, Block, Blocks, Compliance
+from extrusion.compliance import FORCES, WHOLE, Block, Blocks, Compliance, assembled
 from extrusion.gap import Array, Index
 
 N, READ = 1000, 2600
@@ -89,3 +89,20 @@ def test_a_block_is_as_wide_as_its_forces() -> None:
     assert block.D.shape == (FORCES, 400)
     assert 5 < block.U.shape[1] < 48
     assert_allclose(block.whole(), rows, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_assembled(dtype: Any) -> None:
+    """Equal places added up, empty rows, and what has no place."""
+    rng = np.random.default_rng(5)
+    rows, cols = (rng.integers(-1, n, 500).astype(np.int32) for n in (30, 20))
+    rows[rows == 7] = 8
+    values = rng.standard_normal(500)
+    found = assembled(rows, cols, values, (30, 20), dtype)
+    on = (rows >= 0) & (cols >= 0)
+    expected = scipy.sparse.coo_array((values[on], (rows[on], cols[on])), shape=(30, 20)).toarray()
+    assert found.dtype == dtype
+    assert found.nnz == np.count_nonzero(expected)
+    assert_allclose(found.toarray(), expected, atol=1e-6 if dtype == np.float32 else 1e-14)
+    none = np.zeros(0, dtype=np.int32)
+    assert assembled(none, none, np.zeros(0), (3, 2), dtype).nnz == 0
