@@ -2,10 +2,10 @@
 
     python demos/scaling_3d.py [--quick] [--out DIR]
 
-Case A's problem on a quarter of billet and die (`nitsche`, elastic die), by the increments of case B. Each run is in
-processes of its own, by the `mpiexec` beside this Python, with one thread a rank; it is warmed up, so that no form is
-compiled on the clock. Leaves `scaling.csv` and `scaling.md`, and prints the latter: a row a run, then how time and
-memory grow with the dofs.
+Case A's problem on a quarter of billet and die (`nitsche`, elastic die), by the increments of case B: on the surface,
+and up to t = 15 mm by multigrid, with up to 300k dofs. Each run is in processes of its own, by the `mpiexec` beside
+this Python, with one thread a rank; it is warmed up, so that no form is compiled on the clock. Leaves `scaling.csv` and
+`scaling.md`, and prints the latter: a row a run, then how time and memory grow with the dofs.
 
 Columns: dofs; linear solves of the whole run; seconds of set-up, of the parts of the solve phase that the solver tells
 apart (`Result.seconds`: factor of the bulk, condensation on the surface; pairing: the contact points and terms), of
@@ -36,6 +36,9 @@ SIZES = {1: (8.0, 6.0, 4.0, 3.0), 2: (16.0, 12.0, 10.0, 8.0)}
 QUICK = {1: (8.0, 6.0), 2: (16.0, 12.0)}
 """Element sizes (mm) of each order."""
 
+MULTIGRID = (4.0, 2.5, 1.65)
+"""Element sizes (mm) for the iterative solver, order 1."""
+
 RANKS = (1, 2)
 OTHER = ("setup", "solve", "output")
 """Of `Result.seconds`, those that are no part of the solve phase."""
@@ -49,6 +52,7 @@ class Cell:
     size: float  # mm
     ranks: int = 1
     until: float = 155.0  # mm
+    solver: str = "auto"
 
     def case(self) -> Case:
         """Its scene."""
@@ -58,9 +62,9 @@ class Cell:
 
 def child(cell: Cell) -> None:
     """What a run's own processes do: a small run first, then the one that counts; rank 0 prints a line of JSON."""
-    run(replace(cell, size=max(cell.size, 16.0), until=15.0).case())
+    run(replace(cell, size=max(cell.size, 16.0), until=15.0).case(), solver=cell.solver)
     base = resident_memory("VmRSS")
-    result = run(cell.case())
+    result = run(cell.case(), solver=cell.solver)
     comm = MPI.COMM_WORLD
     peak, before = (comm.allreduce(value) for value in (resident_memory("VmHWM"), base))
     found = {step.t: (step.points["K"][1], step.reaction) for step in result.steps}
@@ -106,31 +110,31 @@ def parts_of(rows: list[dict[str, Any]]) -> list[str]:
 def report(rows: list[dict[str, Any]]) -> str:
     """The runs, and how time and memory grow, in Markdown."""
     parts = parts_of(rows)
-    alone = {(row["order"], row["size"]): row["solve"] for row in rows if row["ranks"] == 1}
+    alone = {(row["order"], row["size"], row["solver"]): row["solve"] for row in rows if row["ranks"] == 1}
 
     def cells(row: dict[str, Any]) -> Iterator[str]:
-        yield from (f"Q{row['order']}", f"{row['size']:g} mm", row["solver"], str(row["ranks"]))
+        yield from (f"Q{row['order']}", f"{row['size']:g} mm", row["solver"], f"{row['until']:g}", str(row["ranks"]))
         yield from (str(row["dofs"]), str(row["iterations"]), f"{row['setup']:.2f}")
         yield from (f"{row.get(name, 0.0):.2f}" for name in (*parts, "solve", "increment"))
-        before = alone.get((row["order"], row["size"]))
+        before = alone.get((row["order"], row["size"], row["solver"]))
         yield "" if row["ranks"] == 1 or before is None else f"{before / row['solve']:.2f}"
         yield f"{row['memory']:.0f}"
         for name in ("K_error", "reaction_error"):
             yield "" if row[name] is None else f"{100 * row[name]:.2g}"
 
     told = " ".join(parts)
-    head = f"order size solver ranks dofs iterations set-up {told} solve an_increment speed-up MB K_% R_%"
-    out = [markdown(head, map(list, map(cells, rows)), left=3)]
+    head = f"order size solver to_t ranks dofs iterations set-up {told} solve an_increment speed-up MB K_% R_%"
+    out = [markdown(head, map(list, map(cells, rows)), left=4)]
     growth = []
-    for order, ranks in sorted({(row["order"], row["ranks"]) for row in rows}):
-        mine = [row for row in rows if (row["order"], row["ranks"]) == (order, ranks)]
+    for order, solver, ranks in sorted({(row["order"], row["solver"], row["ranks"]) for row in rows}):
+        mine = [row for row in rows if (row["order"], row["solver"], row["ranks"]) == (order, solver, ranks)]
         dofs = [row["dofs"] for row in mine]
         series = [[row.get(name, 0.0) for row in mine] for name in ("setup", *parts, "solve", "iterations")]
         series.append([row["memory"] - row["memory_before"] for row in mine])
         exponents = (f"{exponent(dofs, values):.2f}" for values in series)
-        growth.append([f"Q{order}", str(ranks), f"{dofs[0]} to {dofs[-1]}", *exponents])
+        growth.append([f"Q{order}", solver, str(ranks), f"{dofs[0]} to {dofs[-1]}", *exponents])
     out.append("p of dofs^p by least squares (MB: beyond that of the small run before):\n")
-    out.append(markdown(f"order ranks dofs set-up {told} solve iterations MB", growth))
+    out.append(markdown(f"order solver ranks dofs set-up {told} solve iterations MB", growth))
     failed = [
         f"Q{row['order']}, {row['size']:g} mm, ranks {row['ranks']}: {row['error']}\n" for row in rows if row["error"]
     ]
@@ -162,12 +166,14 @@ def main() -> None:
         return
     rows: list[dict[str, Any]] = []
     cores = os.cpu_count() or 1
-    for order, sizes in (QUICK if options.quick else SIZES).items():
-        for size in sizes:
-            for ranks in (n for n in RANKS if n <= cores):
-                rows.append(measure(Cell(order, size, ranks)))
-                text = write(options.out, rows)
-                print(f"Q{order}, {size:g} mm, ranks {ranks}: {rows[-1]['solve']:.1f} s", file=sys.stderr)
+    sizes = QUICK if options.quick else SIZES
+    cells = [Cell(order, size) for order in sizes for size in sizes[order]]
+    cells += [Cell(1, size, until=15.0, solver="iterative") for size in MULTIGRID[: 1 if options.quick else None]]
+    for cell in cells:
+        for ranks in (n for n in RANKS if n <= cores):
+            rows.append(measure(replace(cell, ranks=ranks)))
+            text = write(options.out, rows)
+            print(f"Q{cell.order}, {cell.size:g} mm, ranks {ranks}: {rows[-1]['solve']:.1f} s", file=sys.stderr)
     print(text)
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+from numpy.typing import NDArray
 
 from extrusion.compiled import blocks
 from extrusion.gap import Array, Index
@@ -131,7 +132,9 @@ class Blocks:
             self._add(len(self._parts), self._blocks, self._of(self._kind, f), self._of(self._kind, out))
 
 
-def assembled(rows: Index, cols: Index, values: Array, shape: tuple[int, int], dtype: Any) -> Any:
+def assembled(
+    rows: NDArray[np.int32], cols: NDArray[np.int32], values: Array, shape: tuple[int, int], dtype: Any
+) -> Any:
     """A sparse matrix by rows from triplets; those with a negative row or column are left out."""
     ffi, lib = blocks().ffi, blocks().lib
     real, add = ("float[]", lib.csr_float) if dtype == np.float32 else ("double[]", lib.csr_double)
