@@ -325,24 +325,30 @@ def line_points(
     line = np.einsum("qjk,mki->mqji", onto, xs).reshape(-1, n_s, 3)
     middle = np.einsum("qk,mki->mqi", shape2(k_s, np.full(q_t, 0.5), t_line), slave.X).reshape(-1, 3)
     N_line = sign * radial(middle)
-    # 2. pieces, cut where the line passes a ring
+    # 2. pieces, cut where the line passes a ring, each way if it turns back (crushed at the billet's edge)
     p = line[..., 1]
     rings = _Rings(die, z, middle)
-    ends = p[:, [0, -1]]
+    of, begin, end = _one_way(p)
+    ends = np.stack([(lagrange(n_s, xi) * p[of]).sum(axis=1) for xi in (begin, end)], axis=1)
     forward = ends[:, 0] <= ends[:, 1]
     rest = 1e-12 * np.abs(rings.p).max(initial=1.0)
-    low = (rings.p <= ends.min(axis=1)[:, None] + rest).sum(axis=1)
-    high = (rings.p < ends.max(axis=1)[:, None] - rest).sum(axis=1)
+    low = (rings.p[of] <= ends.min(axis=1)[:, None] + rest).sum(axis=1)
+    high = (rings.p[of] < ends.max(axis=1)[:, None] - rest).sum(axis=1)
     cuts = np.maximum(high - low, 0)
-    on = np.repeat(np.arange(len(line)), cuts + 1)  # the line of each piece
+    part = np.repeat(np.arange(len(of)), cuts + 1)  # of each piece
+    on = of[part]  # its line
     nth = np.arange(len(on)) - np.repeat(np.cumsum(cuts + 1) - (cuts + 1), cuts + 1)
-    opposite = np.where(forward[on], low[on] + nth - 1, high[on] - nth - 1)
-    vertex0 = np.where(forward[on], opposite, opposite + 1)
-    vertex1 = np.where(forward[on], opposite + 1, opposite)
-    xi0, xi1 = np.zeros(len(on)), np.ones(len(on))
+    opposite = np.where(forward[part], low[part] + nth - 1, high[part] - nth - 1)
+    vertex0 = np.where(forward[part], opposite, opposite + 1)
+    vertex1 = np.where(forward[part], opposite + 1, opposite)
+    xi0, xi1 = begin[part], end[part]
     where = np.flatnonzero(nth > 0)  # pieces that begin at a split
     order_of_invert = [0, 1] if n_s == 2 else [0, 2, 1]
-    xi0[where] = invert(p[on[where]][:, order_of_invert], rings.p[on[where], vertex0[where]])
+    found = invert(p[on[where]][:, order_of_invert], rings.p[on[where], vertex0[where]])
+    # of the two places of a line that turns back the one in this part
+    turn = np.where(begin > 0, begin, end)[part[where]]
+    elsewhere = (turn < 1) & ((found < begin[part[where]]) | (found > end[part[where]]))
+    xi0[where] = np.where(elsewhere, 2 * turn - found, found)
     splits = rings.split(where, on, vertex0, line, N_line, xi0)
     xi0[where] = splits.xi
     xi1[where - 1] = xi0[where]
@@ -385,6 +391,21 @@ def line_points(
     dweight += (width[:, None] * factor * jacobian_xi)[..., None] * dxi
     gap_xi = np.einsum("nqi,nqi->nq", met.alpha, dx_s)
     return SurfacePoints(**base, gap_xi=gap_xi, G_xi=G_xi, curvature=curvature, dxi=dxi, dweight=dweight)
+
+
+def _one_way(p: Array) -> tuple[Index, Array, Array]:
+    """The parts of lines with these coordinates of their nodes that do not turn back: line, beginning and end."""
+    n = len(p)
+    back = np.ones(n)
+    if p.shape[1] == 3:
+        slope, bend = -3 * p[:, 0] + 4 * p[:, 1] - p[:, 2], 4 * (p[:, 0] - 2 * p[:, 1] + p[:, 2])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            back = -slope / bend
+        back = np.where((back > 1e-9) & (back < 1 - 1e-9), back, 1.0)
+    parts = 1 + (back < 1)
+    of = np.repeat(np.arange(n), parts)
+    second = np.append(False, of[1:] == of[:-1])
+    return of, np.where(second, back[of], 0.0), np.where(second, 1.0, back[of])
 
 
 def _area(X: Array, k: int, s: Array, t: Array, variation: bool) -> tuple[Array, Array]:

@@ -322,11 +322,19 @@ def test_points_meet_the_facet_before_them(k: int, kd: int) -> None:
         assert points.gap[i, 0] == pytest.approx(brute_gap(die, z, x[i, 0], points.direction[i, 0]), abs=1e-9)
 
 
-@pytest.mark.parametrize(("k", "kd"), list(product(KINDS, [*KINDS, None])))
-def test_pieces_make_up_the_facets(k: int, kd: int | None) -> None:
-    """No piece twice, none left out: weights add up to the facets' areas, and no piece passes a ring."""
+@pytest.mark.parametrize(
+    ("k", "kd", "crushed"), [*product(KINDS, [*KINDS, None], [0.0]), (8, None, 0.6), (9, None, 0.6), (9, 9, -0.6)]
+)
+def test_pieces_make_up_the_facets(k: int, kd: int | None, crushed: float) -> None:
+    """No piece twice, none left out: weights add up to the facets' areas, and no piece passes a ring.
+
+    Nor does one where the facets' lines turn back, since nodes in their middle have moved past the quarter point.
+    """
     slave, die = facing(k, kd)
     z = rough(slave, die, 4, 0.1)
+    if crushed:
+        middle = slave.nodes[:, np.abs(places(k)[:, 0] - 0.5) < 1e-9]
+        z[3 * np.unique(middle) + 1] += crushed * np.ptp(slave.X[0, :, 1])
     points = line_points(slave, die, z, 1.0, 4)
     area = pair(slave, die).areas()
     total = np.zeros(len(area))
