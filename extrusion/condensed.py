@@ -35,9 +35,11 @@ import scipy.sparse
 
 from dolfinx.fem.petsc import get_petsc_lib
 
+from extrusion.compiled import blocks
 from extrusion.compliance import Blocks, Compliance, assembled
 from extrusion.errors import InputError
 from extrusion.gap import Array, Index
+from extrusion.mesh import on_root
 from extrusion.problem import BILLET_POINTS, Problem
 from extrusion.system import System, in_words, node_positions
 
@@ -142,6 +144,7 @@ class Condensed(System):
         self.case, self.comm, self.terms = problem.case, problem.comm, problem.terms
         self.n_z, self.n_multipliers = problem.n_z, problem.n_multipliers
         self.on_root = self.comm.rank == 0
+        on_root(self.comm, blocks)  # compiled there, if it has to be
         self._number()
         self._factor()
         size = 1 + self.n_forces + self.n_multipliers
