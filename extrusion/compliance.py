@@ -28,7 +28,8 @@ FORCES = 128
 """Forces of a block where there are more."""
 
 TRIED = 48
-"""Singular vectors of a far part that are looked for; a block whose far parts have more is kept as it is."""
+"""Singular vectors of a far part that are looked for (`blocks.c` has room for twice as many, and more); a block one of
+whose far parts has more is kept as it is."""
 
 WORTH = 0.7
 """Part of its entries that a block may keep as products."""
@@ -53,24 +54,19 @@ class Block:
         n, columns = rows.shape
         far = [rows[:, : near.start], rows[:, near.stop :]]
         largest = float(np.max(np.abs(rows), initial=0.0))
-        if min(n, columns - near.stop + near.start) <= TRIED:
-            found = None
-        else:
-            found = [_product(part, largest) for part in far]
-            if any(size[-1] > LEFT_OUT[np.dtype(np.float64)] for _, _, size in found if len(size)):
-                found = None
+        small = min(n, columns - near.stop + near.start) <= TRIED
+        found = [] if small else [_product(part, largest) for part in far]
         out = []
         for dtype in dtypes:
-            if found is not None:
-                ranks = [int(np.count_nonzero(size > LEFT_OUT[np.dtype(dtype)])) for _, _, size in found]
-                entries = sum(r * (n + part.shape[1]) for r, part in zip(ranks, far, strict=True))
-                if entries + n * (near.stop - near.start) < WORTH * rows.size:
-                    U = np.concatenate([u[:, :r] for (u, _, _), r in zip(found, ranks, strict=True)], axis=1)
-                    V = [v[:r].astype(dtype) for (_, v, _), r in zip(found, ranks, strict=True)]
-                    out.append(cls(near, rows[:, near].astype(dtype), U.astype(dtype), *V))
-                    continue
-            nothing = np.zeros((0, 0), dtype=dtype)
-            out.append(cls(slice(0, columns), rows.astype(dtype), np.zeros((n, 0), dtype=dtype), nothing, nothing))
+            ranks = [int(np.count_nonzero(size > LEFT_OUT[np.dtype(dtype)])) for _, _, size in found]
+            entries = sum(r * (n + part.shape[1]) for r, part in zip(ranks, far, strict=False))
+            if small or max(ranks) == TRIED or entries + n * (near.stop - near.start) >= WORTH * rows.size:
+                nothing = np.zeros((0, 0), dtype=dtype)
+                out.append(cls(slice(0, columns), rows.astype(dtype), np.zeros((n, 0), dtype=dtype), nothing, nothing))
+                continue
+            U = np.concatenate([u[:, :r] for (u, _, _), r in zip(found, ranks, strict=True)], axis=1)
+            V = [v[:r].astype(dtype) for (_, v, _), r in zip(found, ranks, strict=True)]
+            out.append(cls(near, rows[:, near].astype(dtype), U.astype(dtype), *V))
         return out
 
     @property
@@ -80,8 +76,6 @@ class Block:
 
     def whole(self) -> Array:
         """The rows, all columns."""
-        if not self.U.shape[1]:
-            return self.D
         r = len(self.before)
         return np.concatenate([self.U[:, :r] @ self.before, self.D, self.U[:, r:] @ self.after], axis=1)
 
@@ -111,25 +105,30 @@ class Blocks:
     """
 
     def __init__(self, parts: Sequence[tuple[int, int, Block]]) -> None:
-        self._parts = [part for part in parts if len(part[2].D)]
-        ffi, self._dtype = blocks().ffi, self._parts[0][2].D.dtype if self._parts else None
+        parts = [part for part in parts if len(part[2].D)]
+        ffi, self._dtype = blocks().ffi, parts[0][2].D.dtype if parts else None
+        self._held: list[Array] = []  # C has their addresses
         self._add = blocks().lib.add_float if self._dtype == np.float32 else blocks().lib.add_double
         self._kind = "float[]" if self._dtype == np.float32 else "double[]"
         self._of = ffi.from_buffer
-        self._blocks = ffi.new("block[]", len(self._parts))
-        for to, (first, column, part) in zip(self._blocks, self._parts, strict=True):
+        self._blocks = ffi.new("block[]", len(parts))
+        for to, (first, column, part) in zip(self._blocks, parts, strict=True):
             to.rows, to.first, to.to, to.start, to.stop = len(part.D), first, column, part.near.start, part.near.stop
             to.width = part.near.stop + part.after.shape[1]
             to.before, to.after = len(part.before), len(part.after)
-            for name, array in zip("DUVW", (part.D, part.U, part.before, part.after), strict=True):
+            for name, given in zip("DUVW", (part.D, part.U, part.before, part.after), strict=True):
+                # SciPy's matrices may run down their columns
+                array = given if given.strides[1] == given.itemsize else np.ascontiguousarray(given)
+                self._held.append(array)
                 setattr(to, name, ffi.cast("void *", array.ctypes.data))
                 setattr(to, name.lower(), array.strides[0] // array.itemsize)
 
     def add(self, f: Array, out: Array) -> None:
         """Add f times the rows to ``out``; both contiguous and of the blocks' precision."""
-        if self._parts:
-            assert f.dtype == out.dtype == self._dtype
-            self._add(len(self._parts), self._blocks, self._of(self._kind, f), self._of(self._kind, out))
+        if len(self._blocks):
+            if not f.dtype == out.dtype == self._dtype:
+                raise TypeError(f"{f.dtype} and {out.dtype} for blocks of {self._dtype}")
+            self._add(len(self._blocks), self._blocks, self._of(self._kind, f), self._of(self._kind, out))
 
 
 def assembled(
@@ -145,7 +144,7 @@ def assembled(
     row, column, to_start, to_columns, to_scratch = integers
     given = row, column, ffi.from_buffer("double[]", values), *shape
     n = add(count, *given, to_start, to_columns, ffi.from_buffer(real, out), to_scratch)
-    return scipy.sparse.csr_array((out[:n], columns[:n], start), shape=shape)
+    return scipy.sparse.csr_array((out[:n].copy(), columns[:n].copy(), start), shape=shape)
 
 
 def _product(A: Array, largest: float) -> tuple[Array, Array, Array]:

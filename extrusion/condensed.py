@@ -753,7 +753,8 @@ class _Tangent:
         w = self._B @ u[: self._B.shape[1]]
         w[:n] -= F[:n]
         w[n:] = F[n:kept] - w[n:]
-        w = self._getrs(*self._lu, w, trans=1, overwrite_b=True)[0]
+        if kept:  # else there are forces that no longer depend on anything
+            w = self._getrs(*self._lu, w, trans=1, overwrite_b=True)[0]
         self._C_E.add(-w, u)
         u[self._B.shape[1] :] = w[n:]
         x = np.concatenate([w, -F[kept:]])

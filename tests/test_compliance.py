@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.sparse
 from numpy.testing import assert_allclose
 
@@ -106,3 +107,37 @@ def test_assembled(dtype: Any) -> None:
     assert_allclose(found.toarray(), expected, atol=1e-6 if dtype == np.float32 else 1e-14)
     none = np.zeros(0, dtype=np.int32)
     assert assembled(none, none, np.zeros(0), (3, 2), dtype).nnz == 0
+
+
+@pytest.mark.parametrize("single", [False, True])
+def test_matrices_that_run_down_their_columns(single: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SciPy 1.17's Q does, 1.18's does not; C goes along the rows."""
+    C, own = smooth()
+    qr = scipy.linalg.qr
+
+    def down(*args: Any, **options: Any) -> Any:
+        Q, *rest = qr(*args, **options)
+        return np.asfortranarray(Q), *rest
+
+    monkeypatch.setattr("scipy.linalg.qr", down)
+    compliance = made(np.asfortranarray(C), own, single)
+    f = np.random.default_rng(2).standard_normal(N)
+    assert_allclose(compliance.displacements(f), f @ C, rtol=0, atol=1e-12 * np.abs(C).max() * np.abs(f).sum())
+    out = np.zeros(READ, dtype=np.float32 if single else np.float64)
+    every, none = np.arange(N), np.zeros(0, dtype=int)
+    parts = compliance.parts(every, none, None, slice(0, READ))
+    Blocks([(k, 0, block) for k, _, block, _ in parts]).add(f.astype(out.dtype), out)
+    assert_allclose(out, f @ C, rtol=0, atol=(1e-6 if single else 1e-12) * np.abs(C).max() * np.abs(f).sum())
+    with pytest.raises(TypeError, match="float64"):
+        Blocks([(0, 0, compliance._made[0][0])]).add(f.astype(np.float32), out)  # type: ignore[index]
+
+
+def test_nothing_far_away() -> None:
+    """Far parts without any rank are columns of zeros, not none."""
+    own = np.arange(0, READ, 2)
+    C = np.exp(-3.0 * np.abs(own[:, None] - np.arange(READ)))
+    compliance = made(C, own)
+    found = [block for _, _, block, _ in compliance.parts(np.arange(len(own)), own[:0], None, slice(0, READ))]
+    assert min(block.U.shape[1] for block in found) == 0
+    assert_allclose(np.concatenate([block.whole() for block in found]), C, atol=1e-13)
+    assert found[0].part(np.arange(3), slice(2000, READ)).whole().shape == (3, READ - 2000)

@@ -7,6 +7,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from scenes import straight_die
 
 from extrusion import cases
 from extrusion.cases import Case
@@ -93,6 +94,17 @@ def test_choice(caplog: pytest.LogCaptureFixture) -> None:
     assert isinstance(choose(problem, "surface"), Condensed)
     with pytest.raises(InputError, match="solver"):
         choose(problem, "fast")
+
+
+@pytest.mark.parametrize("method", ["penalty", "nitsche"])
+def test_all_contact_opens(method: str) -> None:
+    """The billet leaves what it was pressed by: forces that no longer depend on anything, in an increment by itself."""
+    profile = straight_die(radius=10.0, length=10.0, bore=(9.995, 10.1), stop=60.0)
+    case = replace(cases.A, profile=profile, method=method, order=2, die="rigid", size=1.0).with_increment(2.0, 20.0)
+    system = Condensed(scene(case))
+    found = [step.reaction for step in steps(system, Newton(system), case.times())]
+    assert abs(found[0]) > 0.1
+    assert found[-1] == pytest.approx(0.0, abs=1e-4)
 
 
 def test_a_second_run_is_the_first() -> None:
