@@ -22,11 +22,10 @@ HEAD = [
 ]
 
 SETTINGS: list[tuple[str, int, float | None]] = [  # method, order, size in mm (None: the sheet's divisions)
-    *(("nodal", order, None) for order in (1, 2)),
     *(("penalty", order, size) for order in (1, 2) for size in (None, 4.0)),
     *(
         (method, order, size)
-        for method in ("nitsche", "mortar")
+        for method in ("nodal", "nitsche", "mortar")
         for order, sizes in ((1, (None, 4.0)), (2, (None, 4.0, 2.0, 1.0)))
         for size in sizes
     ),
