@@ -175,6 +175,10 @@ class _Frozen:
         return np.asarray(self.g0[which] + np.einsum("nl,nl->n", self.G[which], z[self.cols[which]]))
 
 
+RESTING = 1e-12
+"""Gap (of the billet's radius) up to which a node without force is open, whatever round-off makes of the gap's sign."""
+
+
 class _Resting:
     """Nodes at a vertex of the die that either facet there would push over to the other one.
 
@@ -302,6 +306,9 @@ class NodalContact:
         lam = z[self.at]
         gap = self._g0 + self._apply(z)
         trial = lam + self._kappa * gap
+        if self.pair.closure == "unilateral":
+            rest = RESTING * self._radius
+            trial[(np.abs(gap) < rest) & (np.abs(lam) < 0.01 * self._kappa * rest)] = 0.0
         if self._expects and self._last is not None:
             sc, dsc = np.where(self._last, trial, 0.0), self._last.astype(float)
         else:

@@ -97,6 +97,19 @@ def test_penalty_on_one_facet(ray: bool, stress: float, direction: list[float]) 
     assert_array_equal(residual(term, displaced(0.1)), 0)
 
 
+@pytest.mark.parametrize("ray", [True, False])
+def test_a_node_at_rest_is_open(ray: bool) -> None:
+    """Whatever the sign that round-off gives a gap of zero without force: or two ranks part here from one."""
+    for gap in (1e-14, -1e-14, 0.0):
+        term, z = facet("nodal", ray), displaced(gap, 2)
+        z[8:] = 1e-12 * np.sign(gap)
+        term.start(z)
+        assert not term.state(z).closed.any()
+    pressed = displaced(-1e-14, 2)
+    assert term.state(pressed).closed.all()
+    assert term.state(displaced(-1e-9, 2)).closed.all()
+
+
 @pytest.mark.parametrize(
     ("ray", "gap", "direction"), [(True, -0.1, [-1.0, 0.75]), (False, -0.08, [-0.8, 0.6])], ids=["ray", "closest"]
 )
