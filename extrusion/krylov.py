@@ -36,6 +36,9 @@ Triplets = tuple[Index, Index, Array]
 RTOL = 1e-9
 """Relative tolerance of a linear solve: small enough for passes of nodal contact to end as with a direct solver."""
 
+MOST = 1e-2
+"""The largest one for methods that follow the geometry, whose next iterate mends what is left."""
+
 
 class Krylov:
     """The tangent of a problem as PETSc's matrix, and its preconditioner.

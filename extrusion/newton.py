@@ -27,6 +27,10 @@ ROUGHLY = 1e-4
 """Part of the first residual at which a solve of few iterations may end."""
 
 
+PREDICTED = 1e-3
+"""Part of the right-hand side that the solve with the expected contact set may leave."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What one nonlinear solve did."""
@@ -93,6 +97,10 @@ class Newton:
         if near and not self._holds:
             self.problem.hold(x)
             self._holds = True
+        # as closely as the method converges (Eisenstat, Walker, SIAM J. Sci. Comput. 17 (1996) 16,
+        # doi:10.1137/0917003)
+        share = 0.1 * (self.history[-1] / self.history[-2]) ** 2 if len(self.history) > 1 else np.inf
+        self.problem.set_accuracy(self.snes.getKSP(), self.tolerance, share)
         A = self.problem.tangent(x, near)
         if A != self.A:
             self._last_A, self.A = self.A, A  # SNES still looks at the old one on its way out of this call
@@ -157,7 +165,7 @@ class Newton:
         self.history, self._update, self._fresh, self._holds, self._watched = [], np.inf, False, False, 0
         self.problem.hold(None)
         self.tolerance = max(self.atol, self.problem.round_off(x))
-        self.problem.set_accuracy(self.snes.getKSP(), self.tolerance)
+        self.problem.set_accuracy(self.snes.getKSP(), self.tolerance, PREDICTED)
         predicted = self._predict(x, ahead)
         self.snes.solve(None, x)
         iterations = self.snes.getIterationNumber() + predicted

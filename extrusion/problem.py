@@ -467,11 +467,12 @@ class Problem(System):
         if self.comm.size > 1:
             PETSc.garbage_cleanup(self.comm)
 
-    def set_accuracy(self, ksp: PETSc.KSP, tolerance: float) -> None:
+    def set_accuracy(self, ksp: PETSc.KSP, tolerance: float, share: float) -> None:
         if self._krylov is not None:
-            from extrusion.krylov import RTOL
+            from extrusion.krylov import MOST, RTOL
 
-            ksp.setTolerances(rtol=RTOL, atol=0.3 * tolerance, max_it=400)
+            close = self.case.method == "nodal" or (self.case.method == "nitsche" and self.case.theta != 0)
+            ksp.setTolerances(rtol=RTOL if close else min(max(RTOL, share), MOST), atol=0.3 * tolerance, max_it=400)
 
     @property
     def iterates(self) -> bool:

@@ -74,8 +74,11 @@ class System(ABC):
     def set_solver(self, ksp: PETSc.KSP) -> None:
         """Say how the tangent's linear systems are solved."""
 
-    def set_accuracy(self, ksp: PETSc.KSP, tolerance: float) -> None:  # noqa: B027
-        """Solve the next linear systems no closer than Newton's method needs, which ends at this residual, N."""
+    def set_accuracy(self, ksp: PETSc.KSP, tolerance: float, share: float) -> None:  # noqa: B027
+        """Solve the next linear system no closer than Newton's method needs, which ends at this residual, N.
+
+        ``share``: of the right-hand side, what may be left so that Newton's method goes on as it does.
+        """
 
     @abstractmethod
     def tangent_without_contact(self) -> PETSc.Mat:

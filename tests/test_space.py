@@ -17,12 +17,13 @@ from scipy.sparse import coo_matrix
 
 from dolfinx import fem
 
-from extrusion import cases
+from extrusion import cases, krylov
 from extrusion.cases import FRONT, SIDE, STEEL, A, Case
 from extrusion.condensed import Condensed
 from extrusion.contact import Closure
 from extrusion.elasticity import Elastic
 from extrusion.errors import InputError
+from extrusion.krylov import Krylov
 from extrusion.mesh import case_mesh, on_root
 from extrusion.mesh3d import HexMesh, hex_mesh, plain_hexes
 from extrusion.newton import Newton
@@ -304,6 +305,30 @@ def test_iterative_is_surface(name: str) -> None:
     assert_allclose(found, expected, rtol=0, atol=1e-7)
     assert step.cuts == 0
     assert newton.snes.getLinearSolveIterations() <= 60 * newton.snes.getIterationNumber()
+
+
+def test_linear_solves_are_no_closer_than_they_need_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same steps and solves with a third fewer cycles of multigrid than if each were solved to the last."""
+    found = []
+    for most in (krylov.MOST, krylov.RTOL):
+        cycles = 0
+
+        def apply(self: Krylov, *of: Any, counted: Any = Krylov.apply) -> None:
+            nonlocal cycles
+            cycles += 1
+            counted(self, *of)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(krylov, "MOST", most)
+            patch.setattr(Krylov, "apply", apply)
+            problem = in_space(**SCENES["nitsche, hex20"])
+            problem.iterate()
+            known = list(steps(problem, Newton(problem), [5.0, 15.0, 25.0]))
+        found.append((cycles, sum(step.iterations for step in known), known[-1].points["K"][1]))
+    (few, solves, K), (many, all_solves, all_K) = found
+    assert few < 0.67 * many
+    assert solves <= all_solves + 2
+    assert pytest.approx(all_K, abs=1e-8) == K
 
 
 @pytest.mark.parametrize("name", SCENES)
