@@ -588,11 +588,9 @@ class _Tangent:
         self._system = weakref.proxy(system)  # PETSc holds this object in C
         self._dtype: Any = _precision(system.case.method, system.n_forces)
         # how closely systems are solved, in parts of the right-hand side: as closely as Newton's method converges
-        # (Eisenstat, Walker, SIAM J. Sci. Comput. 17 (1996) 16, doi:10.1137/0917003), but always most closely for
-        # passes, and for theta, whose forces on the billet's inside outweigh what the gap says
+        # (Eisenstat, Walker, SIAM J. Sci. Comput. 17 (1996) 16, doi:10.1137/0917003)
         self._rtol = 1e-6 if self._dtype == np.float32 else 1e-11
-        close = system.case.method == "nodal" or (system.case.method == "nitsche" and system.case.theta != 0)
-        self._most = self._rtol if close else 1e-2
+        self._most = self._rtol if system.solves_closely else 1e-2
         self._last_norm = np.inf
         self._getrs = scipy.linalg.get_lapack_funcs("getrs", dtype=self._dtype)
         # of each body, which forces have a part in the solve, and the rows of C that are read

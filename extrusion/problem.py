@@ -471,8 +471,8 @@ class Problem(System):
         if self._krylov is not None:
             from extrusion.krylov import MOST, RTOL
 
-            close = self.case.method == "nodal" or (self.case.method == "nitsche" and self.case.theta != 0)
-            ksp.setTolerances(rtol=RTOL if close else min(max(RTOL, share), MOST), atol=0.3 * tolerance, max_it=400)
+            rtol = RTOL if self.solves_closely else min(max(RTOL, share), MOST)
+            ksp.setTolerances(rtol=rtol, atol=0.3 * tolerance, max_it=400)
 
     @property
     def iterates(self) -> bool:

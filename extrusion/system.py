@@ -84,6 +84,16 @@ class System(ABC):
     def tangent_without_contact(self) -> PETSc.Mat:
         """A matrix of the tangent's kind, before there is a tangent."""
 
+    @property
+    def solves_closely(self) -> bool:
+        """Whether linear systems are always solved most closely.
+
+        For passes, whose end hangs on all digits, and for theta, whose forces on the billet's inside outweigh what the
+        gap says.
+        """
+        case = self.case
+        return case.method == "nodal" or (case.method == "nitsche" and case.theta != 0)
+
     def forget_pattern(self) -> None:  # noqa: B027
         """Let go of the contact pairs met so far, if they cost anything."""
 
