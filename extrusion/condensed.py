@@ -405,10 +405,9 @@ class Condensed(System):
         D, f = None, np.zeros(0)
         if self.on_root:
             z, f = self._z(x), self._split(x)[1]
-            rows, cols, values = self.contact_tangent(z, geometric)
-            rows, cols = self._force_of_z[rows], self._row_of_z[cols]
-            keep = (rows >= 0) & (cols >= 0) & (values != 0.0)
-            D = _Derivative(rows[keep], cols[keep], values[keep])
+            rows, cols, values = self.contact_tangent(z, geometric, self._force_of_z >= 0, self._row_of_z >= 0)
+            some = values != 0.0
+            D = _Derivative(self._force_of_z[rows[some]], self._row_of_z[cols[some]], values[some])
         self._tangent.set(D, f)
         return self._A
 

@@ -190,6 +190,17 @@ class Pair(ABC):
         n = len(points.facet)
         return np.concatenate([nodes.reshape(n, nodes.shape[1] * dim), np.broadcast_to(die, (n, len(die)))], axis=1)
 
+    def gap_of(self, body: np.ndarray, points: Points) -> tuple[Array, Index]:
+        """Derivative of the gap by one body's nodes, ``shape=(n, q, L)``, and their entries of z, ``shape=(n, L)``.
+
+        Args:
+            body: Which entries of z are of that body.
+            points: At least one.
+        """
+        local = self.tested(points)
+        local = local[:, body[points.cols[0, local[0]]]]  # all points have one layout
+        return np.take_along_axis(points.G, local[:, None], axis=2), np.take_along_axis(points.cols, local, axis=1)
+
     def forced(self, behind: bool = False) -> Index:
         """Entries of z that forces at the slave's facets (or in the cells behind them) and at the die's go to."""
         if self.closure == "check":

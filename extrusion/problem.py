@@ -38,11 +38,12 @@ from extrusion.elasticity import (
 from extrusion.errors import InputError
 from extrusion.gap import Array, Index, polyline
 from extrusion.gap3d import Revolved
+from extrusion.matrix import TangentMatrix, widened
 from extrusion.mesh import PlainMesh, TaggedMesh, check_profile, distribute, on_root
 from extrusion.pairs import CurvePair, Pair
 from extrusion.pairs3d import COPIES, SurfacePair
 from extrusion.surfaces import FaceTrace, Trace, all_ranks, gather_faces, gather_trace
-from extrusion.system import System, in_words
+from extrusion.system import System, in_words, joined
 from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact
 
 if TYPE_CHECKING:
@@ -341,9 +342,8 @@ class Problem(System):
         self.z_free = ~self._z_held & (self.z_to_x >= 0)
         self._z_row = mine & self.z_free
         indptr, indices, data = self.K.getValuesCSR()
-        self._K_wide = _widen(comm, self.n_local, self.n, indptr, indices, data)
-        self._K_size = _widen(comm, self.n_local, self.n, indptr, indices, np.abs(data))
-        self._tangent = TangentMatrix(comm, self.n_local, self.n, self._row0, indptr, indices, data, held)
+        self._K_wide = widened(comm, self.n_local, self.n, indptr, indices, data)
+        self._K_size = widened(comm, self.n_local, self.n, indptr, indices, np.abs(data))
 
     def gather(self, x: PETSc.Vec) -> Array:
         """The contact vector z of x, on every rank (collective)."""
@@ -374,21 +374,21 @@ class Problem(System):
 
         The rows are those of all ranks, in order; each rank holds those of its own.
         """
-        none = np.zeros(0, dtype=np.int64)
-        A = self._tangent.fill(none, none, np.zeros(0))
-        of_billet = np.zeros(self.n_local, dtype=bool)
+        A = self.K.copy()
+        A.zeroRowsColumns((self._held + self._row0).astype(PETSc.IntType), self.K.getDiagonal().max()[1])
+        of_billet = np.zeros(self._owned + self._n_pressures, dtype=bool)
         blocks = self._blocks_of("billet")
         blocks = blocks[blocks < self._owned // self.dim]
         of_billet[(self.dim * blocks[:, None].astype(np.int64) + np.arange(self.dim)).ravel()] = True
-        of_billet[self._owned : self._owned + self._n_pressures] = True
-        last = self.comm.rank == self.comm.size - 1
-        unknown = np.arange(self.n_local) < self.n_local - (self.n_multipliers if last else 0)
+        of_billet[self._owned :] = True
         out = []
-        for mine in (of_billet, ~of_billet & unknown):
+        for mine in (of_billet, ~of_billet):
             rows = np.flatnonzero(mine) + self._row0
             if self.comm.allreduce(len(rows)):
                 keep = PETSc.IS().createGeneral(rows.astype(PETSc.IntType), comm=self.comm)
                 out.append((A.createSubMatrix(keep, keep), np.concatenate(self.comm.allgather(rows))))
+        A.destroy()
+        self.let_go()
         return out
 
     def places_of(self, points: dict[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
@@ -441,14 +441,17 @@ class Problem(System):
     def tangent(self, x: PETSc.Vec, geometric: bool) -> PETSc.Mat:
         """Derivative of the residual; a new matrix whenever its pattern has grown."""
         z = self.gather(x)
-        rows, cols, values = self.contact_tangent(z, geometric)
         if self._krylov is not None:
-            stiff = [term.stiff(z) for term in self.terms]
-            triplets = (np.concatenate(part) for part in zip(*(part for part, _ in stiff), strict=True))
-            i, j, v = triplets
-            return self._krylov.set((rows, cols, values), (i, j, v), np.concatenate([kappa for _, kappa in stiff]))
-        keep = self._z_row[rows] & self.z_free[cols]
-        return self._tangent.fill(self.z_to_x[rows[keep]] - self._row0, self.z_to_x[cols[keep]], values[keep])
+            # with multipliers every rank needs their rows
+            wanted = self.z_free if self.n_multipliers else self._z_row
+            D = self.contact_tangent(z, geometric, wanted, self.z_free)
+            billet = np.zeros(self.n_z, dtype=bool)
+            billet[: self.dim * self._n_nodes] = np.repeat(self.z_in_billet, self.dim)
+            stiff = [term.stiff(z, billet) for term in self.terms]
+            kappa = np.concatenate([part for _, part in stiff])
+            return self._krylov.set(D, joined([part for part, _ in stiff]), kappa)
+        rows, cols, values = self.contact_tangent(z, geometric, self._z_row, self.z_free)
+        return self._tangent.fill(self.z_to_x[rows] - self._row0, self.z_to_x[cols], values)
 
     def largest_displacement(self, x: PETSc.Vec) -> float:
         """Largest displacement component in x on any rank, multipliers left out."""
@@ -457,10 +460,9 @@ class Problem(System):
 
     def forget_pattern(self) -> None:
         """Let go of the contact pairs met so far: the tangent's pattern is the bulk's again."""
-        self._tangent.reset()
-        if self._krylov is not None:
-            self._displacements_only.reset()
-        self.let_go()
+        if self._krylov is None:
+            self._tangent.reset()
+            self.let_go()
 
     def let_go(self) -> None:
         """Free matrices that are no longer held: on several ranks petsc4py keeps them until all ranks say so."""
@@ -489,7 +491,7 @@ class Problem(System):
         """Whether all ranks say yes."""
         return bool(self.comm.allreduce(yes, op=MPI.LAND)) if self.comm.size > 1 else yes
 
-    @property
+    @cached_property
     def z_rows(self) -> Index:
         """Entries of z that are unknowns of this rank."""
         return self._z_mine[self._z_row[self._z_mine]]
@@ -509,37 +511,14 @@ class Problem(System):
         self._K_wide.mult(x, y)
         y.array[self._held] = x.array_r[self._held]
 
-    def stiffened(self, stiff: tuple[Index, Index, Array]) -> PETSc.Mat:
-        """The bulk, identity-like at the supports, plus triplets over the displacements in z; no multipliers."""
-        rows, cols, values = stiff
-        keep = self._z_row[rows]
-        return self._displacements_only.fill(
-            self.z_to_x[rows[keep]] - self._row0, self.z_to_x[cols[keep]], values[keep]
-        )
-
     @cached_property
-    def _displacements_only(self) -> TangentMatrix:
+    def _tangent(self) -> TangentMatrix:
+        return self._make_tangent()
+
+    def _make_tangent(self) -> TangentMatrix:
+        """Bulk and contact with every unknown; of no use on the surface or with multigrid."""
         indptr, indices, data = self.K.getValuesCSR()
-        n = self.n - self.n_multipliers
-        held = self.held[self.held < n]
-        return TangentMatrix(self.comm, self._owned, n, self._row0, indptr, indices, data, held, self.dim)
-
-    def gather_displacements(self, u: PETSc.Vec) -> Array:
-        """Displacements in z of a vector without multipliers, on every rank."""
-        self._to_z_of_u.scatter(u, self._z_u, addv=False, mode="forward")
-        z = np.zeros(self.n_z - self.n_multipliers)
-        z[self._z_live[: self._z_u.local_size]] = self._z_u.array_r
-        return z
-
-    @cached_property
-    def _z_u(self) -> PETSc.Vec:
-        return PETSc.Vec().createSeq(len(self._z_live) - self.n_multipliers)
-
-    @cached_property
-    def _to_z_of_u(self) -> PETSc.Scatter:
-        u = PETSc.Vec().createMPI((self._owned, PETSc.DETERMINE), comm=self.comm)
-        taken = self.z_to_x[self._z_live[: self._z_u.local_size]].astype(PETSc.IntType)
-        return PETSc.Scatter().create(u, PETSc.IS().createGeneral(taken, comm=PETSc.COMM_SELF), self._z_u, None)
+        return TangentMatrix(self.comm, self.n_local, self.n, self._row0, indptr, indices, data, self.held)
 
     def set_solver(self, ksp: PETSc.KSP) -> None:
         """MUMPS, anew for each tangent; or the Krylov method."""
@@ -612,20 +591,21 @@ class Problem(System):
         """
         case = self.case
         factor = 1.0 if case.theta == 1 else SAFETY
-        if self._indefinite(factor):
+        tangent = self._make_tangent()
+        if self._indefinite(tangent, factor):
             low, high = factor, 2 * factor
-            while self._indefinite(high):
+            while self._indefinite(tangent, high):
                 low, high = high, 2 * high
             while high / low > 1.02:
                 middle = float(np.sqrt(low * high))
-                low, high = (middle, high) if self._indefinite(middle) else (low, middle)
+                low, high = (middle, high) if self._indefinite(tangent, middle) else (low, middle)
             least = high / factor * case.contact_gamma
             remedy = (
                 f"theta = {case.theta} is not safe on this mesh below gamma = {least:.3g}: give more, or theta = -1"
             )
             raise InputError("gamma", case.contact_gamma, remedy)
 
-    def _indefinite(self, factor: float) -> bool:
+    def _indefinite(self, tangent: TangentMatrix, factor: float) -> bool:
         """Whether the closed-edge problem with ``factor`` times the contact stiffness has a negative direction."""
         rows, cols, values = [], [], []
         for term in self.terms:
@@ -637,7 +617,7 @@ class Problem(System):
                 values.append((fixed + factor * with_k)[keep])
         if not rows:
             return False
-        A = self._tangent.fill(*(np.concatenate(part) for part in (rows, cols, values)))
+        A = tangent.fill(*(np.concatenate(part) for part in (rows, cols, values)))
         pc = PETSc.PC().create(self.comm)
         pc.setType("cholesky")
         pc.setFactorSolverType("mumps")
@@ -749,97 +729,6 @@ def _distributed(case: Case, mesh: PlainMesh | HexMesh | None, comm: MPI.Intraco
 
         return distribute_hex(comm, mesh, bodies)  # type: ignore[arg-type]
     return distribute(comm, mesh, bodies)  # type: ignore[arg-type]
-
-
-class TangentMatrix:
-    """Constant bulk plus changing contact entries in one PETSc matrix, held by rows.
-
-    The pattern grows when contact meets a new pair of nodes; as long as it does not, the symbolic factorisation is
-    kept; `reset`, at each increment, lets go of what the billet has left behind. Held rows and columns are those of the
-    identity.
-    """
-
-    def __init__(
-        self,
-        comm: MPI.Intracomm,
-        n_local: int,
-        n: int,
-        row0: int,
-        indptr: Index,
-        indices: Index,
-        data: Array,
-        held: Index,
-        block: int = 1,
-    ) -> None:
-        self._block = block
-        self._comm, self._n_local, self._n, self._row0 = comm, n_local, n, row0
-        self._A: PETSc.Mat | None = None
-        rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
-        is_held = np.zeros(n, dtype=bool)
-        is_held[held] = True
-        off = is_held[rows + row0] | is_held[indices]
-        data = np.where(off, 0.0, data)
-        keys = rows * np.int64(n) + indices
-        own = np.arange(n_local, dtype=np.int64)
-        own = own * np.int64(n) + own + row0  # every diagonal entry, the multipliers' too
-        self._held_keys, self._held_value = (
-            own[is_held[row0 : row0 + n_local]],
-            float(np.max(np.abs(data), initial=1.0)),
-        )
-        self._bulk_keys, self._bulk = keys, data
-        self._least_keys = _sorted_distinct(np.concatenate([keys, own]))
-        self.reset()
-
-    def _set_pattern(self, keys: Index) -> None:
-        self._keys = keys
-        self._base = np.zeros(len(keys))
-        self._base[np.searchsorted(keys, self._bulk_keys)] = self._bulk
-        self._base[np.searchsorted(keys, self._held_keys)] = self._held_value
-
-    def reset(self) -> None:
-        """Back to the bulk's pattern and every diagonal entry."""
-        self._set_pattern(self._least_keys)
-        self._A = None
-
-    def _create(self) -> PETSc.Mat:
-        rows, cols = self._keys // self._n + self._row0, self._keys % self._n
-        A = PETSc.Mat().create(self._comm)
-        A.setSizes(((self._n_local, self._n), (self._n_local, self._n)), bsize=self._block)
-        A.setType("aij")
-        A.setPreallocationCOO(rows.astype(PETSc.IntType), cols.astype(PETSc.IntType))
-        return A
-
-    def fill(self, rows: Index, cols: Index, values: Array) -> PETSc.Mat:
-        """Bulk + triplets (local rows, global columns; repeated entries add up); a new matrix if the pattern grew."""
-        keys = rows * np.int64(self._n) + cols
-        slots = np.searchsorted(self._keys, keys)
-        known = slots < len(self._keys)
-        known[known] = self._keys[slots[known]] == keys[known]
-        grows = not known.all()
-        if self._comm.size > 1:
-            grows = self._comm.allreduce(grows, op=MPI.LOR)
-        if grows:
-            new = _sorted_distinct(keys[~known])
-            self._set_pattern(np.insert(self._keys, np.searchsorted(self._keys, new), new))
-            slots = np.searchsorted(self._keys, keys)
-        data = self._base.copy()
-        np.add.at(data, slots, values)
-        if grows or self._A is None:
-            self._A = self._create()
-        self._A.setValuesCOO(data)
-        return self._A
-
-
-def _widen(comm: MPI.Intracomm, n_local: int, n: int, indptr: Index, indices: Index, data: Array) -> PETSc.Mat:
-    """The bulk matrix with empty rows and columns for the multipliers."""
-    indptr = np.append(indptr, np.full(n_local + 1 - len(indptr), indptr[-1])).astype(PETSc.IntType)
-    return PETSc.Mat().createAIJ(((n_local, n), (n_local, n)), csr=(indptr, indices, data), comm=comm)
-
-
-def _sorted_distinct(keys: Index) -> Index:
-    """`numpy.unique` by sorting: the hashed one is a hundred times slower on such keys (NumPy 2.5)."""
-    keys = np.sort(keys)
-    return keys[np.append(True, keys[1:] != keys[:-1])] if len(keys) else keys
 
 
 def _subdivide(curve: Array, parts: list[int]) -> Array:

@@ -109,15 +109,22 @@ class System(ABC):
                 term.add_residual(z, R)
         return R
 
-    def contact_tangent(self, z: Array, geometric: bool) -> Triplets:
-        """Its derivative as (rows, columns, values); ``geometric`` adds the second variation of the gap."""
+    def contact_tangent(self, z: Array, geometric: bool, rows: np.ndarray, cols: np.ndarray) -> Triplets:
+        """Its derivative as (rows, columns, values).
+
+        Args:
+            z: Where.
+            geometric: Whether to add the second variation of the gap.
+            rows: Which rows to give, ``shape=(n_z,)``.
+            cols: And which columns.
+        """
+        parts = []
         with self._pairs():
-            parts = [term.tangent(z, geometric) for term in self.terms]
-        some = [part for part in parts if len(part[2])] or parts[:1]  # mostly one zone, whose arrays are large
-        if len(some) == 1:
-            return some[0]
-        rows, cols, values = (np.concatenate(part) for part in zip(*some, strict=True))
-        return rows, cols, values
+            for term in self.terms:
+                i, j, values = term.tangent(z, geometric)
+                keep = rows[i] & cols[j]
+                parts.append((i[keep], j[keep], values[keep]))
+        return joined(parts)
 
     @contextmanager
     def _pairs(self) -> Iterator[None]:
@@ -238,3 +245,12 @@ def in_words(place: Array) -> str:
     """A place in the (r, y) half-plane or in space."""
     axes = "(r, y)" if len(place) == 2 else "(x, y, z)"
     return f"{axes} = ({', '.join(f'{value:.3f}' for value in place)}) mm"
+
+
+def joined(parts: list[Triplets]) -> Triplets:
+    """All triplets of some zones."""
+    some = [part for part in parts if len(part[2])] or parts[:1]  # mostly one zone, whose arrays are large
+    if len(some) == 1:
+        return some[0]
+    rows, cols, values = (np.concatenate(part) for part in zip(*some, strict=True))
+    return rows, cols, values

@@ -52,8 +52,11 @@ class ContactTerm(Protocol):
     def hold(self, z: Array | None) -> None:
         """Near the solution: stay with the die facets that are faced at z, where they are not split; None: let go."""
 
-    def stiff(self, z: Array) -> tuple[Triplets, Array]:
-        """What the closed gap's penalty would add to the tangent, and that penalty of each multiplier."""
+    def stiff(self, z: Array, body: np.ndarray) -> tuple[Triplets, Array]:
+        """What the closed gap's penalty would add to one body's tangent, and that penalty of each multiplier.
+
+        ``body``: which entries of z are of that body.
+        """
 
     def accept(self, z: Array) -> None:
         """Make z the accepted state."""
@@ -336,12 +339,13 @@ class NodalContact:
             np.concatenate([self._G.ravel(), constraint.ravel(), dsc - 1.0]),
         )
 
-    def stiff(self, z: Array) -> tuple[Triplets, Array]:
+    def stiff(self, z: Array, body: np.ndarray) -> tuple[Triplets, Array]:
         if not self.multipliers:
             return _none(), self._kappa[:0]
         _, _, dsc = self._law(z)
-        J = np.einsum("n,ni,nj->nij", dsc * self._kappa, self._G, self._G)
-        return _triplets(self._cols, self._cols, J), self._kappa
+        of = body[self._cols[0]]  # all rows have one layout
+        cols, G = self._cols[:, of], self._G[:, of]
+        return _triplets(cols, cols, np.einsum("n,ni,nj->nij", dsc * self._kappa, G, G)), self._kappa
 
     def accept(self, z: Array) -> None:
         if not self.multipliers:
@@ -517,14 +521,16 @@ class IntegratedContact:
             forces, rows = np.take_along_axis(forces, tested[:, None], axis=2), np.take_along_axis(rows, tested, axis=1)
         return _triplets(rows, points.cols, np.swapaxes(forces, 1, 2) @ np.concatenate(right, axis=1))
 
-    def stiff(self, z: Array) -> tuple[Triplets, Array]:
+    def stiff(self, z: Array, body: np.ndarray) -> tuple[Triplets, Array]:
         if self.pair.closure == "check" or self._is_far(z):
             return _none(), np.zeros(0)
         points, S, _ = self._points(z)
         _, _, dsc, k = self._law(z, points, S)
         on = (dsc > 0).any(axis=1)
-        G, w = points.G[on], (points.weight * dsc * k)[on]
-        cols = points.cols[on]
+        if not on.any():
+            return _none(), np.zeros(0)
+        G, cols = self.pair.gap_of(body, take(points, on))
+        w = (points.weight * dsc * k)[on]
         return _triplets(cols, cols, np.swapaxes(w[..., None] * G, 1, 2) @ G), np.zeros(0)
 
     def closed_edge(self) -> tuple[Triplets, Array]:
@@ -735,17 +741,18 @@ class MortarContact:
         trial = self._total * z[self.at] + self._k * weak
         return ContactSet.of(self.pair.along_corners(z), trial, (trial < 0.0) & ~self._free(share))
 
-    def stiff(self, z: Array) -> tuple[Triplets, Array]:
+    def stiff(self, z: Array, body: np.ndarray) -> tuple[Triplets, Array]:
         kappa = self._k / self._total
         if not self.multipliers or self._is_far(z):
             return _none(), kappa[: self.multipliers]
         points = self._points(z)
         _, dsc, w = self._law(z, points)
         psi = self.pair.hats(points)[0] * (w[..., None] * (dsc > 0)[self._ends[points.facet]][:, None])
-        weak = np.swapaxes(psi, 1, 2) @ points.G  # rows of the weak gap, piece by piece
+        G, cols = self.pair.gap_of(body, points)
+        weak = np.swapaxes(psi, 1, 2) @ G  # rows of the weak gap, piece by piece
         rows = np.broadcast_to(self._ends[points.facet][..., None], weak.shape)
-        cols = np.broadcast_to(points.cols[:, None], weak.shape)
-        shape = len(self.closed), int(points.cols.max()) + 1
+        shape = len(self.closed), int(cols.max()) + 1
+        cols = np.broadcast_to(cols[:, None], weak.shape)
         B = scipy.sparse.coo_array((weak.ravel(), (rows.ravel(), cols.ravel())), shape=shape).tocsr()
         J = (B.T @ scipy.sparse.diags_array(kappa) @ B).tocoo()
         return (J.row.astype(np.int64), J.col.astype(np.int64), J.data), kappa
