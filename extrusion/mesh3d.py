@@ -718,13 +718,32 @@ def distribute_hex(comm: MPI.Comm, mesh: HexMesh | None, bodies: Sequence[str] =
     part = part or HexMesh(np.empty((0, 3)), order, {}, {})
     cells, cell_values = _tagged(part.cells, (order + 1) ** 3)
     element = basix.ufl.element("Lagrange", "hexahedron", order, shape=(3,))
-    msh = dolfinx.mesh.create_mesh(comm, cells, ufl.Mesh(element), part.points)
+    sizes = [len(group) for group in part.cells.values()]
+    msh = dolfinx.mesh.create_mesh(comm, cells, ufl.Mesh(element), part.points, _each_body(sizes, len(bodies)))
     tags = []
     for dim, nodes, values in ((3, cells[:, :8].copy(), cell_values), (2, *_tagged(part.facets, 4))):
         entities, local = distribute_entity_data(msh, dim, nodes, values)  # by their vertices at any order
         msh.topology.create_connectivity(dim, 3)
         tags.append(dolfinx.mesh.meshtags_from_entities(msh, dim, adjacencylist(entities), local))
     return TaggedMesh(msh, tags[0], tags[1], {name: TAGS_3D[name] for name in names})
+
+
+def _each_body(sizes: Sequence[int], bodies: int) -> Callable[..., Any]:
+    """A partitioner that spreads each body over all ranks: left to itself, two ranks get one each.
+
+    Args:
+        sizes: This rank's cells of each body, which stand one after the other; none but on rank 0.
+        bodies: How many there are.
+    """
+    partition = dolfinx.mesh.create_cell_partitioner(dolfinx.mesh.GhostMode.none, 2)
+    sizes = sizes or [0] * bodies
+
+    def destinations(comm: MPI.Comm, n: int, types: list[Any], cells: list[Indices]) -> Any:
+        of_body = np.split(cells[0], 8 * np.cumsum(sizes)[:-1])  # by their vertices
+        found = [partition(comm, n, types, [body]).array for body in of_body]
+        return adjacencylist(np.concatenate(found).reshape(-1, 1))._cpp_object
+
+    return destinations
 
 
 def _tagged(groups: Mapping[str, Indices], width: int) -> tuple[Indices, npt.NDArray[np.int32]]:

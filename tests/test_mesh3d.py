@@ -326,6 +326,17 @@ def test_distributed_groups_have_their_measures(order: int) -> None:
 
 
 @pytest.mark.mpi
+def test_each_body_is_spread_over_all_ranks() -> None:
+    """What is done for one body at a time is then done by all of them."""
+    comm = MPI.COMM_WORLD
+    tagged = distribute_hex(comm, hex_mesh(SSNV504, sectors=8) if comm.rank == 0 else None)
+    for body in ("billet", "die"):
+        cells = tagged.cell_tags.find(tagged.groups[body])
+        mine = np.count_nonzero(cells < tagged.msh.topology.index_map(3).size_local)
+        assert mine == pytest.approx(comm.allreduce(mine) / comm.size, rel=0.1)
+
+
+@pytest.mark.mpi
 def test_errors_of_rank_0_are_raised_everywhere() -> None:
     """A rank that went on alone would hang in the next collective call."""
     comm = MPI.COMM_WORLD
