@@ -68,7 +68,7 @@ class Newton:
         self._max = max_iterations
         facet = min((float(np.median(term.pair.slave.length)) for term in problem.terms), default=np.inf)
         self._near = min(0.02 * problem.case.profile.radius, 0.5 * facet) if near is None else near
-        self._update, self._fresh, self._holds, self._watched = np.inf, False, False, 0
+        self._update, self._fresh, self._watched = np.inf, False, 0
         self._f = problem.x.duplicate()
         self._trial = problem.x.duplicate()
         self._trial_f = problem.x.duplicate()
@@ -94,9 +94,8 @@ class Newton:
     def _tangent(self, x: PETSc.Vec) -> None:
         """Hand SNES the tangent; where its pattern has grown it is a new matrix, which the linear solve then takes."""
         near = self._update < self._near
-        if near and not self._holds:
+        if near:
             self.problem.hold(x)
-            self._holds = True
         # as closely as the method converges (Eisenstat, Walker, SIAM J. Sci. Comput. 17 (1996) 16,
         # doi:10.1137/0917003)
         share = 0.1 * (self.history[-1] / self.history[-2]) ** 2 if len(self.history) > 1 else np.inf
@@ -162,7 +161,7 @@ class Newton:
             ahead: The increment over the last one.
         """
         self._limit = self._max if at_most is None else at_most
-        self.history, self._update, self._fresh, self._holds, self._watched = [], np.inf, False, False, 0
+        self.history, self._update, self._fresh, self._watched = [], np.inf, False, 0
         self.problem.hold(None)
         self.tolerance = max(self.atol, self.problem.round_off(x))
         self.problem.set_accuracy(self.snes.getKSP(), self.tolerance, PREDICTED)
