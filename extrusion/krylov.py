@@ -1,6 +1,6 @@
 """The tangent's linear systems by a Krylov method, for bulks too large to factor again and again.
 
-The bulk stays as it is; contact is a few sparse rows D beside it, on every rank whole::
+The bulk stays as it is; contact is a few sparse rows D beside it::
 
     [ K_b + D_bb   D_bd         D_bp ] [ u_b ]
     [ D_db         K_d + D_dd   D_dp ] [ u_d ] = r          b: billet, d: die, p: the multipliers, if there are any
@@ -60,6 +60,7 @@ class Krylov:
         self.A.setUp()
         self._bodies = [_Multigrid(problem, A, rows) for A, rows in problem.bulk()]
         self._z = x.duplicate()
+        self._of_billet = np.isin(problem.x_rows, self._bodies[0].rows)
         self._stiff: Triplets | None = None
         self._fresh = False  # the billet's multigrid knows the contact of now
 
@@ -86,8 +87,8 @@ class Krylov:
         keep = problem.z_free[rows] & problem.z_free[cols]
         stiff = rows[keep], cols[keep], values[keep]
         known, self._stiff = self._stiff, stiff
-        if known is None or not all(np.array_equal(a, b) for a, b in zip(stiff, known, strict=True)):
-            self._fresh = False
+        same = known is not None and all(np.array_equal(a, b) for a, b in zip(stiff, known, strict=True))
+        self._fresh &= problem.agreed(same)
         self.A.assemble()
         return self.A
 
@@ -110,8 +111,7 @@ class Krylov:
             scale = np.where(self._closed & (self._s != 0.0), self._s, 1.0)
             p = np.where(self._closed, 0.0, r / np.where(self._diagonal != 0.0, self._diagonal, 1.0))
             onto = self._Bt @ (np.where(self._closed, self._kappa / scale * r, 0.0) - p)
-            mine = problem.z_rows < first
-            f[problem.x_rows[mine]] += onto[problem.z_rows[mine]]
+            f[problem.x_rows[self._of_billet]] += onto[problem.z_rows[self._of_billet]]
         if not self._fresh:
             billet.make(self._stiff)
             self._fresh = True

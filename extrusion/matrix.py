@@ -13,9 +13,9 @@ from extrusion.gap import Array, Index
 class TangentMatrix:
     """Constant bulk plus changing contact entries in one PETSc matrix, held by rows.
 
-    The pattern grows when contact meets a new pair of nodes; as long as it does not, the symbolic factorisation is
-    kept; `reset`, at each increment, lets go of what the billet has left behind. Held rows and columns are those of the
-    identity.
+    The pattern grows when contact meets a new pair of nodes; as long as it does not, the matrix is the same object, and
+    what was found out of its pattern (symbolic factorisation, aggregates) is kept. `reset` lets go of what the billet
+    has left behind. Held rows and columns are those of the identity.
     """
 
     def __init__(

@@ -375,6 +375,8 @@ class Problem(System):
         The rows are those of all ranks, in order; each rank holds those of its own.
         """
         A = self.K.copy()
+        A.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, True)  # pressures of the die, held, have no diagonal
+        A.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
         A.zeroRowsColumns((self._held + self._row0).astype(PETSc.IntType), self.K.getDiagonal().max()[1])
         of_billet = np.zeros(self._owned + self._n_pressures, dtype=bool)
         blocks = self._blocks_of("billet")
@@ -386,7 +388,10 @@ class Problem(System):
             rows = np.flatnonzero(mine) + self._row0
             if self.comm.allreduce(len(rows)):
                 keep = PETSc.IS().createGeneral(rows.astype(PETSc.IntType), comm=self.comm)
+                if self.Q is None:
+                    keep.setBlockSize(self.dim)  # multigrid takes a node's unknowns together
                 out.append((A.createSubMatrix(keep, keep), np.concatenate(self.comm.allgather(rows))))
+                keep.destroy()
         A.destroy()
         self.let_go()
         return out
@@ -462,7 +467,7 @@ class Problem(System):
         """Let go of the contact pairs met so far: the tangent's pattern is the bulk's again."""
         if self._krylov is None:
             self._tangent.reset()
-            self.let_go()
+        self.let_go()
 
     def let_go(self) -> None:
         """Free matrices that are no longer held: on several ranks petsc4py keeps them until all ranks say so."""

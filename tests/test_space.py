@@ -352,7 +352,10 @@ def test_multigrid_is_kept(law: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_cycles_do_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the penalty, or as the mesh is refined: measured 4.2, 3.7, 5.3 and 5.1, 5.2, 6.2 a linear solve."""
+    """With the penalty, or as the mesh is refined: measured 4.2, 3.7, 5.3 and 5.1, 5.2, 6.2 a linear solve.
+
+    Exact constraints, solved closely, take 11 and 10: 16 when the die was pushed by more than the multipliers.
+    """
 
     def cycles(**of: Any) -> float:
         seen = watched(monkeypatch, [5.0, 15.0, 20.0], order=1, **of)
@@ -362,6 +365,7 @@ def test_cycles_do_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(stiffer) < 1.4 * stiffer[0]
     finer = [cycles(method="nitsche", size=size) for size in (12.0, 8.0, 5.0)]
     assert max(finer) < 1.4 * finer[0]
+    assert max(cycles(method="nodal", size=size) for size in (12.0, 8.0)) < 13.0
 
 
 def test_linear_solves_are_no_closer_than_they_need_be(monkeypatch: pytest.MonkeyPatch) -> None:
