@@ -102,8 +102,11 @@ def surface_memory(problem: Problem) -> float:
     return (12.0 if copied else 8.0) * sum(n * m for n, m in sizes)
 
 
-ITERATIVE_RATE = 6e-5
-"""Seconds an unknown that an iteration of Newton's method takes with multigrid, on one core (EPYC, 2026)."""
+ITERATIVE_RATE = 3e-5
+"""Seconds an unknown that an iteration of Newton's method takes with multigrid, on one core (EPYC, 2026).
+
+1.6e-5 to 1.9e-5 were measured at order 1, and 2.3e-5 to 6e-5 at order 2.
+"""
 
 ITERATIONS = 5
 """Newton iterations an increment that the choice of a solver counts with."""
