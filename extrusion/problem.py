@@ -450,9 +450,7 @@ class Problem(System):
             # with multipliers every rank needs their rows
             wanted = self.z_free if self.n_multipliers else self._z_row
             D = self.contact_tangent(z, geometric, wanted, self.z_free)
-            billet = np.zeros(self.n_z, dtype=bool)
-            billet[: self.dim * self._n_nodes] = np.repeat(self.z_in_billet, self.dim)
-            stiff = [term.stiff(z, billet) for term in self.terms]
+            stiff = [term.stiff(z, self._z_of_billet) for term in self.terms]
             kappa = np.concatenate([part for _, part in stiff])
             return self._krylov.set(D, joined([part for part, _ in stiff]), kappa)
         rows, cols, values = self.contact_tangent(z, geometric, self._z_row, self.z_free)
@@ -505,6 +503,13 @@ class Problem(System):
     def x_rows(self) -> Index:
         """Where this rank's x holds them."""
         return self._x_mine[self._z_row[self._z_mine]]
+
+    @cached_property
+    def _z_of_billet(self) -> np.ndarray:
+        """Which entries of z are displacements of the billet."""
+        out = np.zeros(self.n_z, dtype=bool)
+        out[: self.dim * self._n_nodes] = np.repeat(self.z_in_billet, self.dim)
+        return out
 
     @property
     def held_rows(self) -> Index:
