@@ -33,11 +33,10 @@ import scipy.sparse
 
 from extrusion.gap import Array, Index
 from extrusion.matrix import TangentMatrix
+from extrusion.zones import Triplets
 
 if TYPE_CHECKING:
     from extrusion.problem import Problem
-
-Triplets = tuple[Index, Index, Array]
 
 RTOL = 1e-9
 """Relative tolerance of a linear solve: small enough for passes of nodal contact to end as with a direct solver."""
@@ -81,8 +80,10 @@ class Krylov:
             self._closed, self._kappa = held, kappa
             self._B = self._Bt.T.tocsr()
             norm = np.asarray(self._B.multiply(self._B).sum(axis=1)).ravel()
-            self._s = np.asarray(s_B.multiply(self._B).sum(axis=1)).ravel() / np.where(norm > 0, norm, 1.0)
-            self._diagonal = whole[first:, first:].diagonal()
+            s = np.asarray(s_B.multiply(self._B).sum(axis=1)).ravel() / np.where(norm > 0, norm, 1.0)
+            self._s = np.where(held & (s != 0.0), s, 1.0)
+            diagonal = whole[first:, first:].diagonal()
+            self._diagonal = np.where(diagonal != 0.0, diagonal, 1.0)
         rows, cols, values = stiff
         keep = problem.z_free[rows] & problem.z_free[cols]
         stiff = rows[keep], cols[keep], values[keep]
@@ -108,9 +109,8 @@ class Krylov:
         p = np.zeros(0)
         if problem.n_multipliers:
             r = problem.gather(b)[first:]
-            scale = np.where(self._closed & (self._s != 0.0), self._s, 1.0)
-            p = np.where(self._closed, 0.0, r / np.where(self._diagonal != 0.0, self._diagonal, 1.0))
-            onto = self._Bt @ (np.where(self._closed, self._kappa / scale * r, 0.0) - p)
+            p = np.where(self._closed, 0.0, r / self._diagonal)
+            onto = self._Bt @ (np.where(self._closed, self._kappa / self._s * r, 0.0) - p)
             f[problem.x_rows[self._of_billet]] += onto[problem.z_rows[self._of_billet]]
         if not self._fresh:
             billet.make(self._stiff)
@@ -119,12 +119,10 @@ class Krylov:
         if problem.n_multipliers or len(self._bodies) > 1:
             z = problem.gather(self._z)
             if problem.n_multipliers:
-                p += np.where(self._closed, self._kappa * (self._B @ z[:first] - r / scale), 0.0)
+                p += np.where(self._closed, self._kappa * (self._B @ z[:first] - r / self._s), 0.0)
                 z[first:] = p
             for die in self._bodies[1:]:
                 f[problem.x_rows] -= self._D @ z
-                if die.unmade:
-                    die.make()
                 u[die.rows] = die.solve(f[die.rows])
         if len(p) and problem.comm.rank == problem.comm.size - 1:
             u[-len(p) :] = p
@@ -171,11 +169,6 @@ class _Multigrid:
         sizes = A.local_size[0], A.size[0], self._first
         return TangentMatrix(A.comm.tompi4py(), *sizes, indptr, indices, data, none, self._dim)
 
-    @property
-    def unmade(self) -> bool:
-        """Whether there is none yet."""
-        return self._pc is None
-
     def make(self, stiff: Triplets | None = None) -> None:
         """Make it, or make it anew, of the bulk and symmetric triplets over the displacements in z. Collective."""
         P = self._A
@@ -200,7 +193,9 @@ class _Multigrid:
         self._pc.setUp()
 
     def solve(self, f: Array) -> Array:
-        """Solve nearly, of this rank's rows."""
+        """Solve nearly, of this rank's rows; of the bulk alone if it has not been made of more. Collective."""
+        if self._pc is None:
+            self.make()
         assert self._pc is not None
         self._f.array[:] = f
         self._pc.apply(self._f, self._u)

@@ -718,8 +718,8 @@ def distribute_hex(comm: MPI.Comm, mesh: HexMesh | None, bodies: Sequence[str] =
     part = part or HexMesh(np.empty((0, 3)), order, {}, {})
     cells, cell_values = _tagged(part.cells, (order + 1) ** 3)
     element = basix.ufl.element("Lagrange", "hexahedron", order, shape=(3,))
-    sizes = [len(group) for group in part.cells.values()]
-    msh = dolfinx.mesh.create_mesh(comm, cells, ufl.Mesh(element), part.points, _each_body(sizes, len(bodies)))
+    sizes = [len(part.cells.get(body, ())) for body in bodies]
+    msh = dolfinx.mesh.create_mesh(comm, cells, ufl.Mesh(element), part.points, _each_body(sizes))
     tags = []
     for dim, nodes, values in ((3, cells[:, :8].copy(), cell_values), (2, *_tagged(part.facets, 4))):
         entities, local = distribute_entity_data(msh, dim, nodes, values)  # by their vertices at any order
@@ -728,15 +728,13 @@ def distribute_hex(comm: MPI.Comm, mesh: HexMesh | None, bodies: Sequence[str] =
     return TaggedMesh(msh, tags[0], tags[1], {name: TAGS_3D[name] for name in names})
 
 
-def _each_body(sizes: Sequence[int], bodies: int) -> Callable[..., Any]:
+def _each_body(sizes: Sequence[int]) -> Callable[..., Any]:
     """A partitioner that spreads each body over all ranks: left to itself, two ranks get one each.
 
     Args:
         sizes: This rank's cells of each body, which stand one after the other; none but on rank 0.
-        bodies: How many there are.
     """
     partition = dolfinx.mesh.create_cell_partitioner(dolfinx.mesh.GhostMode.none, 2)
-    sizes = sizes or [0] * bodies
 
     def destinations(comm: MPI.Comm, n: int, types: list[Any], cells: list[Indices]) -> Any:
         of_body = np.split(cells[0], 8 * np.cumsum(sizes)[:-1])  # by their vertices

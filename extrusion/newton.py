@@ -95,7 +95,7 @@ class Newton:
         """Hand SNES the tangent; where its pattern has grown it is a new matrix, which the linear solve then takes."""
         near = self._update < self._near
         if near:
-            self.problem.hold(x)
+            self.problem.hold(x)  # each time: what has left its facet is held to the next one
         # as closely as the method converges (Eisenstat, Walker, SIAM J. Sci. Comput. 17 (1996) 16,
         # doi:10.1137/0917003)
         share = 0.1 * (self.history[-1] / self.history[-2]) ** 2 if len(self.history) > 1 else np.inf
