@@ -148,19 +148,22 @@ class Newton:
             return int(reason.DIVERGED_FNORM_NAN)
         if norm <= self.tolerance:
             return int(reason.CONVERGED_FNORM_ABS)
+        if it and norm <= self._share * self.history[0]:
+            return int(reason.CONVERGED_FNORM_RELATIVE)
         if it >= self._limit or (self._limit < self._max and norm < ROUGHLY * self.history[0]):
             return int(reason.DIVERGED_MAX_IT)
         return int(reason.ITERATING)
 
-    def solve(self, x: PETSc.Vec, at_most: int | None = None, ahead: float = 1.0) -> Outcome:
+    def solve(self, x: PETSc.Vec, at_most: int | None = None, ahead: float | None = 1.0, share: float = 0.0) -> Outcome:
         """Solve from x, in place; x already carries the supports' values.
 
         Args:
             x: Start and result.
             at_most: Take no more than so many iterations.
-            ahead: The increment over the last one.
+            ahead: The increment over the last one; None: the contact set is that of x.
+            share: End at this part of the first residual.
         """
-        self._limit = self._max if at_most is None else at_most
+        self._limit, self._share = self._max if at_most is None else at_most, share
         self.history, self._update, self._fresh, self._watched = [], np.inf, False, 0
         self.problem.hold(None)
         self.tolerance = max(self.atol, self.problem.round_off(x))
@@ -171,7 +174,7 @@ class Newton:
         reason = self.snes.getConvergedReason()
         return Outcome(reason > 0, iterations, self.history[-1], REASONS.get(reason, str(reason)))
 
-    def _predict(self, x: PETSc.Vec, ahead: float) -> int:
+    def _predict(self, x: PETSc.Vec, ahead: float | None) -> int:
         """One linear solve with the contact set that is expected: it hardly moves in the die as the billet slides by.
 
         Newton's method would find the ends of the contact by steps of a few facets. Kept unless the residual triples.

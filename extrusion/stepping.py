@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from petsc4py import PETSc
 
 import numpy as np
 
 from extrusion.errors import StepError
-from extrusion.newton import Newton
+from extrusion.newton import Newton, Outcome
 from extrusion.pairs import ContactState
 from extrusion.system import System
 
@@ -41,6 +41,18 @@ SETTLE = 3
 
 DAMP = 8
 """Passes after which billet and die are paired halfway between the last two solutions."""
+
+SOFT = 10.0
+"""Contact stiffness gamma that an increment is solved with at once; it is led to a larger one (`_led`)."""
+
+STIFFEN = 10.0
+"""Ratio of the contact stiffness between two solves that lead to a large one."""
+
+LEAST = 1.5
+"""The ratio below which this is given up."""
+
+LED = 1e-2
+"""Part of its first residual at which a solve on the way may end."""
 
 PASS_TOLERANCE = 0.01
 """Passes stop when the displacement increment changes by less than this part of itself (the sheet's RESI_GEOM)."""
@@ -178,7 +190,10 @@ def _increment(problem: System, newton: Newton, accepted: PETSc.Vec, ahead: floa
         problem.pair_up(x, settle, previous if damp else None)
         x.copy(previous)
         rough &= attempt <= ROUGH
-        outcome = newton.solve(x, AT_MOST if rough else None, 0.0 if frozen and attempt > 1 else ahead)
+        if frozen:
+            outcome = newton.solve(x, AT_MOST if rough else None, 0.0 if attempt > 1 else ahead)
+        else:
+            outcome = _led(problem, newton, ahead)
         iterations += outcome.iterations
         if not outcome.converged and not (rough and np.isfinite(outcome.residual)):
             if attempt == 1 and problem.may_settle:
@@ -207,3 +222,37 @@ def _increment(problem: System, newton: Newton, accepted: PETSc.Vec, ahead: floa
         remedy = "A node rests on a die corner: change the --increment a little, or use --method nitsche"
         return _Attempt(False, iterations, PASSES, outcome.residual, reason, remedy)
     return _Attempt(True, iterations, attempt, outcome.residual, outcome.reason)
+
+
+def _led(problem: System, newton: Newton, ahead: float) -> Outcome:
+    """Solve one predicted increment, in place: with a soft contact first, if it is stiff, and led from there.
+
+    Where the gap is curved or changes facet an update is off by some part of its square; times a large stiffness that
+    is a large force, which Newton's method answers by letting go. From a softer contact's solution the update is as
+    short as that contact's penetration: ten times the stiffness then costs two to five solves, whatever the stiffness.
+    Where that leads nowhere the increment is solved at once.
+    """
+    x, case = problem.x, problem.case
+    soft = SOFT * STIFFEN if case.theta == 1 else SOFT  # which is not coercive below 27 to 36
+    gamma = case.contact_gamma if case.method in ("penalty", "nitsche") else soft
+    predicted, reached = x.duplicate(), x.duplicate()
+    x.copy(predicted)
+    at, ratio, iterations = 0.0, STIFFEN, 0
+    while True:
+        goal = max(soft, ratio * at) if at < np.inf else gamma
+        if goal > gamma / np.sqrt(ratio):  # no further solve for a ratio as small as that
+            goal = gamma
+        problem.soften(goal / gamma)
+        outcome = newton.solve(x, ahead=None if 0.0 < at < np.inf else ahead, share=0.0 if goal == gamma else LED)
+        iterations += outcome.iterations
+        if goal == gamma and (outcome.converged or at in (0.0, np.inf)):
+            return replace(outcome, iterations=iterations)
+        if outcome.converged:
+            at = goal
+            x.copy(reached)
+        elif at and ratio > LEAST:
+            ratio **= 0.5
+            reached.copy(x)
+        else:
+            at = np.inf
+            predicted.copy(x)

@@ -173,6 +173,11 @@ class System(ABC):
         for term in self.terms:
             term.hold(z)
 
+    def soften(self, share: float) -> None:
+        """Take this part of the contact stiffness from now on, where contact has one (`ContactTerm.soften`)."""
+        for term in self.terms:
+            term.soften(share)
+
     def expect(self, ahead: float | None) -> bool:
         """Take the contact set that is expected as given (`ContactTerm.expect`); say if any zone has one."""
         return any([term.expect(ahead) for term in self.terms])

@@ -52,6 +52,9 @@ class ContactTerm(Protocol):
     def hold(self, z: Array | None) -> None:
         """Near the solution: stay with the die facets that are faced at z, where they are not split; None: let go."""
 
+    def soften(self, share: float) -> None:
+        """Take this part of the contact stiffness from now on (nothing, where the constraint is exact)."""
+
     def stiff(self, z: Array, body: np.ndarray) -> tuple[Triplets, Array]:
         """What the closed gap's penalty would add to one body's tangent, and that penalty of each multiplier.
 
@@ -294,6 +297,9 @@ class NodalContact:
     def hold(self, z: Array | None) -> None:
         pass
 
+    def soften(self, share: float) -> None:
+        pass
+
     def expect(self, ahead: float | None) -> bool:
         # across an increment other nodes come to lie where the die is met; from pass to pass they are the same
         self._expects = ahead == 0.0 and self._last is not None
@@ -399,7 +405,8 @@ class IntegratedContact:
         interpenetrating: bool = False,
         order: int = 4,
     ) -> None:
-        self.pair, self._k, self._material, self._theta = pair, stiffness, material, theta
+        self.pair, self._stiffness, self._material, self._theta = pair, stiffness, material, theta
+        self.soften(1.0)
         self.forced = pair.forced(behind=bool(theta) and material is not None)
         self._radius, self._interpenetrating, self._order = radius, interpenetrating, order
         self.closed, self.caught = np.zeros(len(pair.slave.nodes), dtype=bool), 0.0
@@ -410,6 +417,9 @@ class IntegratedContact:
 
     def hold(self, z: Array | None) -> None:
         self._held = None if z is None or self._is_far(z) else self.pair.facing(self._points(z)[0])
+
+    def soften(self, share: float) -> None:
+        self._k = share * self._stiffness
 
     def start(self, z: Array) -> None:
         self._expected = Expected()
@@ -609,6 +619,9 @@ class MortarContact:
 
     def hold(self, z: Array | None) -> None:
         self._held = None if z is None or self._is_far(z) else self.pair.facing(self._points(z))
+
+    def soften(self, share: float) -> None:
+        pass
 
     def start(self, z: Array) -> None:
         self._expected = Expected()

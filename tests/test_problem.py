@@ -350,13 +350,13 @@ class Reluctant(Newton):
 
     solved = 0.0
 
-    def solve(self, x: PETSc.Vec, at_most: int | None = None, ahead: float = 1.0) -> Outcome:
+    def solve(self, x: PETSc.Vec, at_most: int | None = None, ahead: float | None = 1.0, share: float = 0.0) -> Outcome:
         t = float(x.array_r[self.problem._driven[0]])
         if t - self.solved > 12:
             x.set(np.nan)
             return Outcome(False, 3, np.inf, "too far")
         self.solved = t
-        return super().solve(x, at_most, ahead)
+        return super().solve(x, at_most, ahead, share)
 
 
 @pytest.mark.parametrize("law", ["nodal", "nitsche 0"])
@@ -380,6 +380,22 @@ def test_a_residual_that_goes_round_is_left() -> None:
     *_, last = steps(system, Newton(system), list(np.arange(5.0, 156.0, 5.0)))
     assert last.cuts == 0
     assert WATCH < last.iterations < 20
+
+
+def test_a_stiff_contact_is_led_to() -> None:
+    """Newton's method alone stops at t = 5 with gamma = 1e4, where penalty and Nitsche's method are one."""
+    mesh, apart = case_mesh(A.profile, 4.0), {}
+    for gamma in (1e2, 1e4):
+        K = []
+        for law in ("penalty", "nitsche 0"):
+            case = replace(A, **LAWS[law] | {"gamma": gamma}, order=2, size=4.0)
+            system = Condensed(Problem(case, mesh, MPI.COMM_SELF))
+            run = list(steps(system, Newton(system), list(np.arange(5.0, 41.0, 5.0))))
+            assert sum(step.cuts for step in run) == 0
+            assert max(step.iterations for step in run) <= 40
+            K.append(run[-1].points["K"][1])
+        apart[gamma] = abs(K[1] - K[0])
+    assert apart[1e4] < 0.02 * apart[1e2]
 
 
 def test_a_step_that_cannot_be_solved_says_where() -> None:
