@@ -172,7 +172,8 @@ class Newton:
         self.snes.solve(None, x)
         iterations = self.snes.getIterationNumber() + predicted
         reason = self.snes.getConvergedReason()
-        return Outcome(reason > 0, iterations, self.history[-1], REASONS.get(reason, str(reason)))
+        residual = self.history[-1] if self.history else np.inf  # SNES has not asked where the first one is no number
+        return Outcome(reason > 0, iterations, residual, REASONS.get(reason, str(reason)))
 
     def _predict(self, x: PETSc.Vec, ahead: float | None) -> int:
         """One linear solve with the contact set that is expected: it hardly moves in the die as the billet slides by.

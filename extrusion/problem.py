@@ -25,7 +25,7 @@ from dolfinx import fem
 
 from extrusion.cases import GAMMA, LOCKING_FROM, Case, Zone
 from extrusion.compiled import ray
-from extrusion.contact import REFERENCE_NU, stiffness
+from extrusion.contact import CLOSED_GAP, REFERENCE_NU, stiffness
 from extrusion.elasticity import (
     epsilon,
     mixed_virtual_work,
@@ -86,6 +86,12 @@ class Problem(System):
             log.warning("20-node hexahedra under nodal pressure: its vertices pull, use nitsche or mortar")
         if case.space == "3d" and case.order == 1 and case.method != "nodal" and comm.rank == 0:
             log.warning("order = 1 in 3D: facets are chords of the circle, and contact holds these: use order 2")
+        overlap = case.profile.overlap
+        if overlap > CLOSED_GAP * case.profile.radius and comm.rank == 0:
+            log.warning("the billet stands up to %.3g mm deep in the die at t = 0: an interference fit", overlap)
+        billet_slave = any(zone.slave == "billet" and zone.contact != "check" for zone in case.zones)
+        if case.die == "elastic" and case.die_material.E < case.billet.E and billet_slave and comm.rank == 0:
+            log.warning('the die is softer than the billet: let it be the slave (slave = "die"), or steps may fail')
         bodies = ("billet", "die") if case.die == "elastic" else ("billet",)
         self.tagged: TaggedMesh = _distributed(case, mesh, comm, bodies)
         self.bodies = bodies
@@ -287,11 +293,12 @@ class Problem(System):
         material, sign = case.billet, 1.0
         if zone.slave == "die":
             slave, master, material, sign = master, slave, case.die_material, -1.0
-        ray = (zone.gap or ("closest" if case.method == "nodal" else "ray")) == "ray"
         # past its ends the die goes on straight; but what a glissière without a second zone pushes past F is let go
         extended = zone.contact != "bilateral" or len(case.zones) > 1
+        extended &= (zone.slave, zone.billet) != ("die", "side")  # the bore goes on where the billet does not
         common: dict[str, Any] = dict(
-            name=zone.name, slave=slave, die=master, axis=AXIS[zone.ray], sign=sign, closure=zone.contact, ray=ray,
+            name=zone.name, slave=slave, die=master, axis=AXIS[zone.ray], sign=sign, closure=zone.contact,
+            ray=case.along_ray(zone),
             smooth=zone.smooth, extended=extended,
         )  # fmt: skip
         pair: Pair = SurfacePair(**common)

@@ -14,6 +14,7 @@ from petsc4py import PETSc
 
 import numpy as np
 
+from extrusion.cases import Case
 from extrusion.errors import StepError
 from extrusion.newton import Newton, Outcome
 from extrusion.pairs import ContactState
@@ -128,7 +129,7 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
             if dt < 0.999 * least:
                 raise StepError(
                     f"step to t = {goal:.6g} mm not solved after {cuts - 1} cuts: {outcome.reason}; {place}. "
-                    f"{outcome.remedy}"
+                    f"{outcome.remedy or _remedy(problem.case)}"
                 )
             log.info("t = %.6g mm: %s; %s; cut to %.3g mm", goal, outcome.reason, place, dt)
         z = problem.gather(x)
@@ -151,6 +152,14 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
         caught = dict.fromkeys(caught, 0.0)
 
 
+def _remedy(case: Case) -> str:
+    """What else may solve a step."""
+    if case.method in ("nitsche", "mortar") and case.order == 2:
+        other = "mortar" if case.method == "nitsche" else "nitsche"
+        return f"Try another --increment, a finer mesh, or --method {other}"
+    return "Try another --increment, a finer mesh, or --method nitsche or mortar on P2"
+
+
 def _caught(problem: System, t: float) -> dict[str, float]:
     """What each bilateral zone has just taken hold of, with a warning where that was far from the die."""
     out = {term.pair.name: term.caught for term in problem.terms if term.pair.closure == "bilateral"}
@@ -167,7 +176,7 @@ class _Attempt:
     passes: int
     residual: float
     reason: str
-    remedy: str = "Try another --increment, a finer mesh, or --method nitsche or mortar on P2"
+    remedy: str = ""
 
 
 def _increment(problem: System, newton: Newton, accepted: PETSc.Vec, ahead: float) -> _Attempt:

@@ -398,6 +398,40 @@ def test_a_stiff_contact_is_led_to() -> None:
     assert apart[1e4] < 0.02 * apart[1e2]
 
 
+def test_an_increment_that_begins_with_no_number_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SNES stops at once where the first residual is NaN, before it has asked for convergence."""
+    case, mesh = replace(A, die="rigid", **LAWS["nitsche 0"]), case_mesh(A.profile)
+    system = Condensed(Problem(case, mesh, MPI.COMM_SELF))
+    evaluate, times = system.residual, []
+
+    def lost(x: PETSc.Vec, f: PETSc.Vec) -> None:
+        evaluate(x, f)
+        times.append(float(x.array_r[0]))
+        if times[-1] == 20 and 15 not in times:
+            f.set(np.nan)
+
+    monkeypatch.setattr(system, "residual", lost)
+    *_, step = steps(system, Newton(system), [10.0, 20.0])
+    assert (step.t, step.cuts) == (20, 1)
+
+
+def test_a_die_softer_than_the_billet_is_slave(caplog: pytest.LogCaptureFixture) -> None:
+    """What of the bore lies beyond the billet meets nothing: it had met the billet's side, extended."""
+    soft = replace(A, size=8.0, order=2, method="nitsche", billet=Elastic(5000, 0.3), die_material=Elastic(2000, 0.3))
+    mesh = case_mesh(A.profile, 8.0)
+    Problem(soft, mesh, MPI.COMM_SELF)
+    assert "the die is softer than the billet" in caplog.text
+    zones = tuple(replace(zone, slave="die") for zone in A.zones)
+    system = Condensed(Problem(replace(soft, zones=zones), mesh, MPI.COMM_SELF))
+    *_, last = steps(system, Newton(system), [5.0, 10.0, 15.0, 20.0])
+    assert last.cuts == 0
+    side = last.zones["1"]
+    beyond = side.x[:, 1] > last.points["L"][1] + A.profile.points["L"][1] + 1e-9
+    assert np.any(side.closed)
+    assert not np.any(side.closed[beyond])
+    assert last.reaction == pytest.approx(-last.die_reaction, rel=1e-6)
+
+
 def test_a_step_that_cannot_be_solved_says_where() -> None:
     """Time, zone, place and remedy; the steps before are kept."""
     problem = Problem(replace(A, **LAWS["nitsche 0"]), case_mesh(A.profile), MPI.COMM_SELF)
