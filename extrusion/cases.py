@@ -41,8 +41,15 @@ def _number(name: str, value: object, low: float = -math.inf, remedy: str = "giv
     return float(value)
 
 
+MOST_STEPS = 100_000
+"""Increments of a table, at most."""
+
+OVERLAP = 0.25
+"""How deep the billet may stand in the die at t = 0, by its radius; deeper, the scene is wrong."""
+
+
 def _choice(name: str, value: object, allowed: tuple[object, ...]) -> None:
-    if value not in allowed:
+    if not any(type(value) is type(one) and value == one for one in allowed):  # 1.0 and true are no 1
         raise InputError(name, value, f"choose one of {', '.join(map(str, allowed))}")
 
 
@@ -86,6 +93,13 @@ class Figure:
     point: str = "K"
     quantity: Literal["u_y", "gap", "open"] = "u_y"
     contact: Literal["solved", "check"] = "solved"  # check: the run with contact checked, not enforced
+
+    def __post_init__(self) -> None:
+        _number("figures.t", self.t, 0.0, "give a positive t in mm")
+        _number("figures.value", self.value)
+        _number("figures.tolerance", self.tolerance, -1e-300, "give a relative tolerance, not below 0")
+        _choice("figures.quantity", self.quantity, ("u_y", "gap", "open"))
+        _choice("figures.contact", self.contact, ("solved", "check"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +152,8 @@ class Case:
                     raise InputError(name, getattr(self, name), "leave it out: it is for space = '3d'")
         remedy = "give a distance in mm, of either sign"
         object.__setattr__(self, "off_symmetry", _number("off_symmetry", self.off_symmetry, -math.inf, remedy))
+        if self.theta and self.method != "nitsche":
+            raise InputError("theta", self.theta, "leave it out: it is a variant of method = 'nitsche'")
         _choice("form", self.form, ("displacement", "mixed", None))
         if self.form == "mixed" and self.order == 1:
             raise InputError("form", "mixed", "needs order 2 (Taylor-Hood: quadratic displacement, linear pressure)")
@@ -161,24 +177,54 @@ class Case:
                 raise InputError(
                     f"zones.{zone.name}.slave", "die", "a rigid die has no stress: let the billet be slave"
                 )
-            if self.method == "mortar" and (zone.gap == "closest" or zone.slave == "die"):
-                raise InputError(
-                    f"zones.{zone.name}", self.method, "measures the ray gap on the billet: set slave and gap so"
-                )
+            for name, value, needed in (("gap", zone.gap, "ray"), ("slave", zone.slave, "billet")):
+                if self.method == "mortar" and value not in (needed, None):
+                    raise InputError(f"zones.{zone.name}.{name}", value, f"method = 'mortar' knows {needed!r} only")
             if zone.die == "cone" and not self.profile.cone:
                 raise InputError(f"zones.{zone.name}.die", "cone", "the profile names no cone")
+            self._check_ray(zone)
         if not self.increments:
             raise InputError("increments", [], "give at least one pair (increment, up to t)")
-        t = 0.0
+        t = count = 0.0
         table = []
         for row in self.increments:
             if not isinstance(row, tuple | list) or len(row) != 2:
                 raise InputError("increments", row, "each row is a pair (increment, up to t) in mm")
             step = _number("increments", row[0], 0.0, "an increment must be a positive length in mm")
             until = _number("increments", row[1], t, f"the table must increase: give a t above {t:g} mm")
+            count += (until - t) / step
+            if count > MOST_STEPS:
+                raise InputError("increments", step, f"give a longer increment: at most {MOST_STEPS} of them")
             t = until
             table.append((step, until))
         object.__setattr__(self, "increments", tuple(table))
+        for figure in self.figures:
+            if figure.point not in self.profile.points:
+                known = ", ".join(self.profile.points)
+                raise InputError("figures.point", figure.point, f"name a point of the profile: {known}")
+
+    def _check_ray(self, zone: Zone) -> None:
+        """Refuse a master that is no graph along the zone's ray, and a billet deep in the die."""
+        profile = self.profile
+        if self.along_ray(zone):
+            if zone.slave == "billet":
+                base = [profile.points[name][1 if zone.ray == "r" else 0] for name in getattr(profile, zone.die)]
+                flat = base not in (sorted(set(base)), sorted(set(base), reverse=True))
+            else:
+                flat = (zone.billet, zone.ray) not in (("side", "r"), ("front", "y"))
+            if flat:
+                of = zone.die if zone.slave == "billet" else zone.billet
+                other = "y" if zone.ray == "r" else "r"
+                raise InputError(
+                    f"zones.{zone.name}.ray",
+                    zone.ray,
+                    f"meets the {of} along it, or twice: take {other!r}, or another gap",
+                )
+        if profile.overlap > OVERLAP * profile.radius and zone.contact != "check":
+            remedy = (
+                f"the billet stands {profile.overlap:g} mm deep in the die at t = 0: give at most {OVERLAP:g} of it"
+            )
+            raise InputError("profile.radius", profile.radius, remedy)
 
     @property
     def end(self) -> float:
@@ -208,6 +254,10 @@ class Case:
     def contact_gamma(self) -> float:
         """The dimensionless contact stiffness in force."""
         return GAMMA[self.method] if self.gamma is None else self.gamma
+
+    def along_ray(self, zone: Zone) -> bool:
+        """Whether a zone's gap is measured along its ray (else to the closest point)."""
+        return (zone.gap or ("closest" if self.method == "nodal" else "ray")) == "ray"
 
     def times(self) -> list[float]:
         """The t of every increment, mm; the last increment of a row is shortened to end on it."""

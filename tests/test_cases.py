@@ -43,7 +43,16 @@ def test_a_is_the_sheets() -> None:
     "case",
     [
         A,
-        replace(A, name="mine", title='a "quoted" \\ title, größer', gamma=0.1 + 0.2, theta=-1, size=3.7, figures=()),
+        replace(
+            A,
+            name="mine",
+            title='a "quoted" \\ title, größer',
+            method="nitsche",
+            gamma=0.1 + 0.2,
+            theta=-1,
+            size=3.7,
+            figures=(),
+        ),
         replace(A, mesh="/a mesh.msh", die="rigid", increments=((10, 15), (5, 20), (35, 155))).with_contact(
             "bilateral"
         ),
@@ -72,7 +81,14 @@ def test_toml_and_back(case: Case, tmp_path: Path) -> None:
         ("metod", "nodal", "metod"),
         ("method", "glue", "method"),
         ("order", 3, "order"),
+        ("order", 2.0, "order"),
+        ("order", True, "order"),
         ("theta", 0.5, "theta"),
+        ("theta", 1, "theta"),
+        ("figures.0.point", "X", "figures.point"),
+        ("figures.0.quantity", "u_z", "figures.quantity"),
+        ("figures.0.t", 0, "figures.t"),
+        ("figures.0.tolerance", -0.1, "figures.tolerance"),
         ("gamma", -1.0, "gamma"),
         ("size", float("inf"), "size"),
         ("zones.0.closure", "bilateral", "zones.closure"),
@@ -85,10 +101,13 @@ def test_toml_and_back(case: Case, tmp_path: Path) -> None:
         ("increments", [[5, 20], [5, 20]], "increments"),
         ("increments", [[-5, 20]], "increments"),
         ("increments", [5, 155], "increments"),
+        ("increments", [[1e-4, 155]], "increments"),
         ("increments", None, "increments"),
         ("profile.die", [["A", 50, 0], ["B", 60, 70], ["C", 60, 0], ["D", 50, 70]], "profile.die"),  # crosses itself
         ("profile.die.1", ["B", float("nan"), 70], "profile.die B"),
         ("profile.radius", 0, "profile.radius"),
+        ("profile.radius", 70, "profile.radius"),  # the bore has 50
+        ("profile.length", 650, "profile.radius"),  # the die has 230
         ("profile.bore", ["A", "C"], "profile.bore"),
         ("name", "", "name"),
     ],
@@ -99,6 +118,33 @@ def test_refused(path: str, value: Any, field: str) -> None:
         cases.from_dict(changed(path, value))
     assert error.value.field == field
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("billet", "die", "slave", "along"),
+    [("side", "bore", "billet", "r"), ("front", "cone", "billet", "y"), ("side", "bore", "die", "r")],
+)
+def test_a_ray_along_the_master_is_refused(billet: str, die: str, slave: str, along: str) -> None:
+    """The gap along a ray needs a master that each ray meets once; to the closest point it does not."""
+    zone = cases.Zone(name="1", billet=billet, die=die, slave=slave, ray=along)
+    across = replace(zone, ray="y" if along == "r" else "r")
+    case = replace(A, method="nitsche", zones=(zone,), figures=())
+    if die == "bore":
+        with pytest.raises(InputError, match=f"zones.1.ray = '{across.ray}': .* take '{along}'"):
+            replace(case, zones=(across,))
+        replace(case, method="nodal", zones=(across,))
+    else:  # a cone is a graph over either
+        replace(case, zones=(across,))
+
+
+def test_overlap() -> None:
+    """The bore has r = 50 up to y = 70, then narrows by 1 in 3; the cone stands at y = 205 above r = 48."""
+    assert A.profile.overlap == 0
+    assert replace(A.profile, radius=52).overlap == pytest.approx(2)
+    assert replace(A.profile, length=76).overlap == pytest.approx(2)
+    assert replace(A.profile, length=209).overlap == pytest.approx(5)
+    assert replace(A.profile, radius=44, length=213).overlap == pytest.approx(213 - 206.25)
+    assert replace(A.profile, radius=20, length=213).overlap == 0
 
 
 def test_increments() -> None:
