@@ -18,6 +18,10 @@ __version__ = "0.1.0"
 __all__ = ["Result", "__version__", "run"]
 
 
+def __dir__() -> list[str]:
+    return [*globals(), "Result", "run"]
+
+
 def __getattr__(name: str) -> Any:
     if name not in ("Result", "run"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

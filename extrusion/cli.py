@@ -1,7 +1,7 @@
 """The command ``extrusion``.
 
-Exit codes: 0 done, 1 a step could not be solved or a figure is out, 2 bad input. DOLFINx is imported by the commands
-that need it, so that help and lists are quick.
+Exit codes: 0 done, 1 a step could not be solved or a figure is out, 2 bad input, 130 interrupted. DOLFINx is imported
+by the commands that need it, so that help and lists are quick.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import importlib.util
 import json
 import logging
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
@@ -28,7 +29,7 @@ from rich.table import Table
 import extrusion
 from extrusion.cases import CASES, METHODS, Case, read_toml
 from extrusion.contact import CLOSURES
-from extrusion.errors import InputError
+from extrusion.errors import InputError, StepError
 
 if TYPE_CHECKING:
     from extrusion.estimate import Goal
@@ -44,6 +45,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
 
 CaseName = Annotated[str, typer.Argument(metavar="CASE|FILE.toml", help="A case of `extrusion list`, or a file.")]
 
@@ -160,12 +164,12 @@ def run(
         if json_file and not to_stdout:
             _check_writable("json", json_file)
         _warn_of_ranks()
-        with _progress(scene, quiet) as observers:
+        with _progress(scene, quiet) as observers, _Interrupt() as interrupt:
             result = solve(
                 scene,
                 out=out,
                 pictures=pictures,
-                observers=observers,
+                observers=[*observers, interrupt],
                 solver=solver,
                 tolerance=tolerance,
                 goal=cast("Goal", goal or "K"),
@@ -181,7 +185,7 @@ def run(
         console.print(f"Files are in {out}", soft_wrap=True, highlight=False)
     if not result.converged:
         _say(f"{result.error} (accepted steps are kept in {out})")
-        raise typer.Exit(1)
+        raise typer.Exit(INTERRUPTED if interrupt.stopped else 1)
 
 
 @app.command()
@@ -408,7 +412,7 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
         sys.exit(2)
     except typer.Abort:
         _say("interrupted")
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
     except Exception:
         MPI = getattr(sys.modules.get("mpi4py.MPI"), "COMM_WORLD", None)
         if MPI is None or MPI.size == 1:
@@ -417,6 +421,39 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
         sys.stderr.flush()
         MPI.Abort(1)
         raise
+
+
+class _Interrupt:
+    """Ctrl-C while a case runs: the first one lets the step in hand end, and its files be written; the next ends all.
+
+    An observer. Before there is an accepted step the first one ends all: a rank that raised an exception would leave
+    the others waiting for it.
+    """
+
+    def __init__(self) -> None:
+        self.stopped, self._heard, self._may_stop = False, 0, False
+
+    def __enter__(self) -> _Interrupt:
+        self._before = signal.signal(signal.SIGINT, lambda *_: self._hear())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self._before)
+
+    def _hear(self) -> None:
+        self._heard += 1
+        if self._heard > 1 or not self._may_stop:
+            _say("interrupted")
+            sys.stderr.flush()
+            os._exit(INTERRUPTED)
+        _say("interrupted: stops after this step (again: at once)")
+
+    def __call__(self, problem: Problem, step: Step) -> None:
+        """Stop if any rank has been told to. Collective."""
+        self._may_stop = True
+        if problem.comm.allreduce(self._heard):
+            self.stopped = True
+            raise StepError(f"interrupted after t = {step.t:g} mm")
 
 
 def _say(message: str) -> None:
@@ -474,14 +511,15 @@ def _check_writable(field: str, path: Path) -> None:
 
 def _write_json(result: Result, path: Path | None) -> None:
     text = json.dumps(result.to_dict(), allow_nan=False) + "\n"
-    if path is None:
-        sys.stdout.write(text)
-        return
     try:
+        if path is None:
+            sys.stdout.write(text)
+            sys.stdout.flush()
+            return
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise InputError("json", str(path), f"cannot be written ({error.strerror})") from None
+        raise InputError("json", str(path or "-"), f"cannot be written ({error.strerror})") from None
 
 
 def _warn_of_ranks() -> None:
@@ -490,7 +528,9 @@ def _warn_of_ranks() -> None:
 
     require_dolfinx()
     from mpi4py import MPI
+    from petsc4py import PETSc
 
+    PETSc.Sys.popSignalHandler()  # which answers a closed pipe, or `kill`, with a page
     here, cores = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).size, os.cpu_count() or 1
     if here > cores:
         _say(f"{here} ranks on {cores} cores wait for one another; use at most {cores}")

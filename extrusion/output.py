@@ -71,7 +71,9 @@ class Folder:
 
         def make() -> None:
             self.path.mkdir(parents=True, exist_ok=True)
-            (self.path / "history.csv").touch()
+            for name in ("history.csv", "contact.csv"):
+                (self.path / name).open("a", encoding="utf-8").close()  # refused before anything is removed
+            (self.path / "contact.csv").unlink()
             for name in ("run.json", "snapshots.npz", *(f"{kind}.png" for kind in plots.KINDS)):
                 (self.path / name).unlink(missing_ok=True)  # an earlier run's
 
@@ -105,7 +107,6 @@ def run_record(result: Result, options: dict[str, Any]) -> dict[str, Any]:
     given = {name: value for name, value in options.items() if value is not None}
     return {
         **result.to_dict(),
-        "error": result.error,
         "version": extrusion.__version__,
         "options": given,
         "toml": to_toml(result.case),
@@ -271,6 +272,10 @@ class Faces:
         return None if u is None else (np.concatenate(u)[self._first], np.concatenate(mises))
 
 
+INVERTED = 1e-3
+"""Part of the billet's section that may be turned inside out without a warning, at the corners."""
+
+
 class Camera:
     """Takes the steps nearest to some t, and the last one, as `Snapshots` on rank 0: in space those of the plane z = 0.
 
@@ -285,6 +290,7 @@ class Camera:
         self._taken: dict[float, tuple[Array, Array]] = {}
         self._last: tuple[Problem, Step] | None = None  # not taken yet
         self._faces: Faces | None = None
+        self._warned = False
 
     def __call__(self, problem: Problem, step: Step) -> None:
         """Take a step if it is wanted. Collective."""
@@ -302,8 +308,30 @@ class Camera:
         if self._faces is None:
             self._faces = Faces(problem, ("billet_z", "die_z"))
         found = self._faces.fields(problem, step)
-        if found is not None:
-            self._taken[step.t] = found
+        if found is None:
+            return
+        self._taken[step.t] = found
+        share = self._inverted(found[0])
+        if share > INVERTED and not self._warned:
+            self._warned = True
+            log.warning(
+                "t = %.6g mm: %.2g %% of the billet's section is turned inside out: small strain has no more to say",
+                step.t,
+                100 * share,
+            )
+
+    def _inverted(self, u: Array) -> float:
+        """Part of the billet's section, in the plane or in that of symmetry, whose cells have turned over."""
+        faces = self._faces
+        assert faces is not None
+        corners = faces.corners[faces.billet]
+
+        def areas(x: Array) -> Array:
+            across, along = x[corners[:, 2]] - x[corners[:, 0]], x[corners[:, -1]] - x[corners[:, 1]]
+            return np.asarray(across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0])
+
+        before, now = (areas(x[:, :2]) for x in (faces.points, faces.points + u))
+        return float(np.sum(np.abs(before[before * now < 0])) / np.sum(np.abs(before)))
 
     def snapshots(self) -> Snapshots | None:
         """What has been taken; a quadrilateral as two triangles."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from extrusion.cases import Case, from_dict
 from extrusion.errors import InputError
-from extrusion.result import PICTURED, Array, Result, Snapshots, element_name
+from extrusion.result import PICTURED, Array, Result, Snapshots, element_name, per_thickness
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -188,15 +188,24 @@ def _most(stress: Array, snapshots: Snapshots) -> float:
 
 def history(record: Record) -> Figure:
     """Reaction on the rear face, and how far K is ahead of it, against t; the sheet's figures as marks."""
-    from matplotlib.ticker import ScalarFormatter
-
-    figure = _figure(record, 7, 5.6)
+    figure = _figure(record, 7.2, 5.6, left=1.0)
     top, bottom = figure.subplots(2, 1, sharex=True)
     top.axhline(0, color="0.6", linewidth=0.8)
-    top.plot(record.t, record.reaction / 1e6, ".-", color="C0")
-    top.set_yscale("symlog", linthresh=1.0)  # some tenths of MN in the bore, tens on the cone
-    top.yaxis.set_major_formatter(ScalarFormatter())
-    top.set_ylabel("reaction on the rear face [MN]")
+    peak = np.max(np.abs(record.reaction))
+    prefix, unit = next(((name, size) for name, size in (("M", 1e6), ("k", 1e3)) if peak >= size), ("", 1.0))
+    force = record.reaction / unit
+    top.plot(record.t, force, ".-", color="C0")
+    unit_name = f"[{prefix}N{per_thickness(record.case)}]"
+    linear = _linear_part(force)
+    if linear < np.max(np.abs(force)):
+        unit_name += f", logarithmic from {linear:g} on"
+        ticks = _ticks(force, linear)
+        top.set_yscale("symlog", linthresh=linear)
+        top.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        top.minorticks_off()
+    if peak < 1e-9 * record.case.billet.E * record.case.profile.radius**2:  # round-off
+        top.set_ylim(-1, 1)
+    top.set_ylabel(f"reaction on the rear face\n{unit_name}")
     bottom.axhline(0, color="0.6", linewidth=0.8)
     bottom.plot(record.t, record.u_y_K - record.t, ".-", color="C0", label="computed")
     checked = all(zone.contact == "check" for zone in record.case.zones)
@@ -217,6 +226,26 @@ def history(record: Record) -> Figure:
         ax.grid(alpha=0.25)
         ax.margins(x=0.02)
     return figure
+
+
+def _linear_part(force: Array) -> float:
+    """Up to where an axis is linear: all of it, unless a few values are far larger than the rest."""
+    size = np.abs(force)
+    usual = float(np.quantile(size, 0.75))
+    if not 0.0 < 8 * usual < size.max():
+        return float(size.max())
+    decade = 10.0 ** np.floor(np.log10(usual))
+    return float(decade * next(part for part in (1, 2, 5, 10) if part * decade >= usual))
+
+
+def _ticks(force: Array, linear: float) -> Array:
+    """Of an axis that is logarithmic beyond its linear part: halves of that, and 1, 2, 5 in each decade after it."""
+    decades = 10.0 ** np.arange(np.floor(np.log10(linear)), np.log10(np.max(np.abs(force))) + 1)
+    beyond = np.outer(decades, [1, 2, 5]).ravel()
+    size = np.concatenate([[0.5 * linear, linear], beyond[beyond >= 1.5 * linear]])
+    ticks = np.concatenate([-size[::-1], [0.0], size])
+    low, high = min(force.min(), 0.0), max(force.max(), 0.0)
+    return np.asarray(ticks[((ticks > 1.2 * low) & (ticks < 1.2 * high)) | (ticks == 0)])
 
 
 def pressure(record: Record) -> Figure:
@@ -251,7 +280,7 @@ def pressure(record: Record) -> Figure:
     ax.set(xlabel="y [mm]", ylabel="contact pressure on the side [MPa]")
     ax.grid(alpha=0.25, axis="y")
     if times:
-        ax.legend(frameon=False)
+        ax.legend(framealpha=1, edgecolor="none")  # over the die's lines
     return figure
 
 
@@ -275,7 +304,7 @@ def rings(y: Array, p: Array, width: float) -> tuple[Array, Array, Array, Array]
     return mean[0], mean[1], np.minimum.reduceat(p, starts), np.maximum.reduceat(p, starts)
 
 
-def _figure(record: Record, width: float, height: float, right: float = 0.2) -> Figure:
+def _figure(record: Record, width: float, height: float, left: float = 0.75, right: float = 0.2) -> Figure:
     """An empty figure (inches) outside pyplot, with the run as its title; a notebook shows it.
 
     Its margins are set: to find them out, matplotlib would draw all text twice.
@@ -284,7 +313,7 @@ def _figure(record: Record, width: float, height: float, right: float = 0.2) -> 
 
     figure = Figure(figsize=(width, height))
     figure.subplots_adjust(
-        *(0.75 / width, 0.55 / height, 1 - right / width, 1 - 0.6 / height), wspace=0.04, hspace=0.08
+        *(left / width, 0.55 / height, 1 - right / width, 1 - 0.6 / height), wspace=0.04, hspace=0.08
     )
     case = record.case
     figure.suptitle(f"Case {case.name}: {case.method}, {element_name(case)}, {case.die} die", fontsize="medium")

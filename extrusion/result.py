@@ -9,7 +9,7 @@ import dataclasses
 import html
 import math
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -114,12 +114,20 @@ class Result:
         return np.array([step.iterations for step in self.steps], dtype=np.int64)
 
     def point(self, name: str) -> Array:
-        """Displacement (u_r, u_y) of a named point, mm, ``shape=(steps, 2)``."""
-        return np.array([step.points[name] for step in self.steps]).reshape(-1, 2)
+        """Displacement (u_r, u_y) of a named point, mm, ``shape=(steps, 2)``.
+
+        Raises:
+            InputError: The mesh has no node there.
+        """
+        return np.array([_named("point", name, step.points) for step in self.steps]).reshape(-1, 2)
 
     def gap(self, name: str) -> Array:
-        """Gap at a named slave point, mm, ``shape=(steps,)``."""
-        return np.array([step.gap[name] for step in self.steps])
+        """Gap at a named slave point, mm, ``shape=(steps,)``.
+
+        Raises:
+            InputError: It is no point of a slave surface.
+        """
+        return np.array([_named("gap", name, step.gap) for step in self.steps])
 
     def figures(self) -> list[Comparison]:
         """The sheet's figures for contact as this run has it (solved, or only checked)."""
@@ -147,6 +155,7 @@ class Result:
             "ranks": self.ranks,
             "solver": self.solver,
             "converged": self.converged,
+            "error": self.error,
             "seconds": dict(self.seconds),
             "estimate": self.estimate and self.estimate.to_dict(),
             "steps": [
@@ -218,7 +227,8 @@ class Result:
         e = self.estimate
         bars = (["± mm"], ["± kN"]) if e else ([], [])
         header = ["t mm", "u_y(K) mm", *bars[0], *(["sheet mm", "diff. %"] if figures else [])]
-        header += ["reaction kN", *(bars[1] or ["energy J"])]
+        per = per_thickness(self.case)
+        header += [f"reaction kN{per}", *(bars[1] or [f"energy J{per}"])]
         header += [*(f"gap({name}) mm" for name in gaps), "iterations", "cuts"]
         rows = []
         for step in (self.steps[i] for i in chosen):
@@ -235,11 +245,22 @@ class Result:
         return header, rows
 
 
+def _named[T](what: str, name: str, values: Mapping[str, T]) -> T:
+    if name not in values:
+        raise InputError(what, name, f"choose one of {', '.join(values)}")
+    return values[name]
+
+
 def element_name(case: Case) -> str:
     """In short: P1 or P2 (triangles), Q1 or Q2 (hexahedra), or 20-node (serendipity hexahedra)."""
     if case.element == "serendipity":
         return "20-node"
     return f"{'Q' if case.space == '3d' else 'P'}{case.order}"
+
+
+def per_thickness(case: Case) -> str:
+    """What forces and energies are divided by: nothing, or the slab's thickness."""
+    return "/mm" if case.space == "plane strain" else ""
 
 
 def _fixed(value: float, digits: int) -> str:
@@ -279,6 +300,15 @@ def changed(case: Case, **changes: Any) -> Case:
         changes["mesh"] = None
     if changes.get("space", case.space) != case.space:
         changes = {"mesh": None, "sectors": None, "element": "lagrange", **changes}
+    if changes.get("method", case.method) != "nitsche" and case.theta:
+        changes = {"theta": 0, **changes}  # it is a variant of that
+    if changes.get("space") == "plane strain":
+        changes = {"figures": (), **changes}  # which are of the whole revolution
+    fields = [f.name for f in dataclasses.fields(Case)]
+    for name, value in changes.items():
+        if name not in fields:
+            known = ", ".join([*fields, "contact", "increment", "until"])
+            raise InputError(name, value, f"no such option; choose from {known}")
     return dataclasses.replace(case, **changes) if changes else case
 
 
@@ -332,12 +362,20 @@ def run(
     from extrusion.problem import Problem
     from extrusion.stepping import steps
 
+    if not isinstance(case, Case):
+        raise InputError("case", case, "give a Case: extrusion.cases.A, or extrusion.cases.read_toml(FILE)")
     if solver not in SOLVERS:
         raise InputError("solver", solver, f"choose one of {', '.join(SOLVERS)}")
+    if goal not in ("K", "reaction"):
+        raise InputError("goal", goal, "choose one of K, reaction")
     comm = MPI.COMM_WORLD if comm is None else comm
     given = str(mesh) if isinstance(mesh, str | Path) else None
     plain = None if isinstance(mesh, str | Path) else mesh
     case = changed(case, mesh=given, **changes)
+    top = max(y for _, _, y in case.profile.die)
+    if case.end > top:
+        remedy = f"end before the rear face leaves the die, which ends at y = {top:g} mm"
+        raise InputError("increments", case.end, remedy)
     if solver == "iterative" and (case.space != "3d" or case.mixed):
         why = "the displacement form" if case.space == "3d" else "space = '3d'"
         raise InputError("solver", solver, f"is for {why}: choose surface, full or auto")
@@ -482,6 +520,12 @@ def verify(case: Case, **options: Any) -> list[Result]:
     """
     if not case.figures:
         raise InputError("figures", [], f"case {case.name} has none to verify")
+    times = case.times()
+    for figure in case.figures:
+        if not any(math.isclose(t, figure.t, rel_tol=1e-9) for t in times):
+            raise InputError(
+                "figures.t", figure.t, f"no increment of case {case.name} ends there: add a row to its table"
+            )
     asked = {figure.contact for figure in case.figures}
     variants = {"solved": case, "check": case.with_contact("check")}
     return [run(variant, **options) for contact, variant in variants.items() if contact in asked]

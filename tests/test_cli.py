@@ -2,8 +2,10 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -54,6 +56,7 @@ BROKEN = {
     "short.toml": 'name = "short"\n',
     "nu.toml": cases.to_toml(cases.A).replace("nu = 0.45", "nu = 0.5"),
     "key.toml": "metod = 1\n" + cases.to_toml(cases.A),
+    "between.toml": cases.to_toml(replace(cases.A, figures=(replace(cases.A.figures[0], t=7.0),))),
     "place.toml": cases.to_toml(cases.A).replace('name = "A"', 'name = "../place"', 1),
     "mesh.msh": "no mesh",
     "flat.msh": msh((2, 3)),
@@ -89,6 +92,10 @@ BROKEN = {
         ("run A --increment 0", "--increment = 0.0"),
         ("run A --until 0", "--until = 0.0"),
         ("run A --until 156", "--until = 156.0"),
+        ("run A --until 500 --increment 50", "increments = 500.0: end before the rear face leaves the die"),
+        ("run A --increment 1e-6", "increments = 1e-06: give a longer increment: at most 100000"),
+        ("run A --theta 1", "--theta = 1: leave it out: it is a variant of method = 'nitsche'"),
+        ("verify between.toml", "figures.t = 7.0: no increment of case A ends there"),
         ("run A --gamma -3", "--gamma = -3.0"),
         ("run A --theta -2", "--theta = -2"),
         ("run A --out mesh.txt", "--out = 'mesh.txt': cannot be written"),
@@ -141,11 +148,11 @@ def test_bad_input(here: Path, capsys: Capture, args: str, told: str) -> None:
 
 def test_run(here: Path, capsys: Capture) -> None:
     """Files in results/CASE, a table on stdout, progress on stderr, the JSON of the issue."""
-    assert command("run", "A", "--until", "20", "--json", "sub/a.json", "--theta", "-1") == 0
+    assert command("run", "A", "--until", "20", "--json", "sub/a.json", "--method", "nitsche", "--theta", "-1") == 0
     out, err = capsys.readouterr()
-    assert "20.79" in out
+    assert "20.892" in out
     assert "results/A" in out
-    assert "u_y(K) = 20.79" in err
+    assert "u_y(K) = 20.892" in err
     assert {"history.csv", "contact.csv", "fields.bp", "run.json"} <= {p.name for p in (here / "results/A").iterdir()}
     data = json.loads((here / "sub/a.json").read_text())
     assert [step["t"] for step in data["steps"]] == [5, 10, 15, 20]
@@ -182,6 +189,31 @@ def test_failed_step(here: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatc
     data = json.loads((here / "a.json").read_text())
     assert (data["converged"], [step["t"] for step in data["steps"]]) == (False, [5])
     assert len((here / "results/A/history.csv").read_text().splitlines()) == 2
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_interrupted(here: Path, ranks: int) -> None:
+    """Ctrl-C: the step in hand is the last one; all files are written, and all ranks end."""
+    start = [sys.executable, "-m", "extrusion", "run", "A", "--increment", "0.05", "--json", "a.json", "--out", "out"]
+    if ranks > 1:
+        launcher = Path(sys.executable).with_name("mpiexec")
+        if not launcher.exists() or (os.cpu_count() or 1) < ranks:
+            pytest.skip("no mpiexec beside this Python, or one core")
+        start = [str(launcher), "-n", str(ranks), *start]
+    running = subprocess.Popen(start, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    history = here / "out/history.csv"
+    for _ in range(600):
+        if history.exists() and len(history.read_text().splitlines()) > 2:
+            break
+        time.sleep(0.1)
+    os.killpg(running.pid, signal.SIGINT)
+    told = running.communicate(timeout=60)[1].splitlines()
+    assert running.returncode == 130, told
+    assert sum("stops after this step" in line for line in told) == 1
+    data = json.loads((here / "a.json").read_text())
+    assert data["error"] == f"interrupted after t = {data['steps'][-1]['t']:g} mm"
+    assert len(history.read_text().splitlines()) == len(data["steps"]) + 1 > 2
+    assert command("plot", "out") == 0
 
 
 @pytest.mark.parametrize(("value", "code"), [(20.825, 0), (20.9, 1)])

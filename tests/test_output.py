@@ -208,6 +208,47 @@ def test_pictures(result: Result, folder: Path) -> None:
         result.plot("billets")  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("reaction", "unit", "labels"),
+    [
+        ([0.0, 2e5, 8e5], "[kN]", None),
+        ([0.0, -3e5, 7e5, 8e5, 3e7], "[MN], logarithmic from 1 on", ["0", "0.5", "1", "2", "5", "10", "20"]),
+        ([0.0, 1e-20], "[N]", None),
+    ],
+)
+def test_axis_of_the_reaction(reaction: list[float], unit: str, labels: list[str] | None) -> None:
+    """In a unit of its size; logarithmic, and said to be, where a few values are far larger than the rest."""
+    pytest.importorskip("matplotlib")
+    t = np.arange(1.0, len(reaction) + 1)
+    axes = plots.history(plots.Record(cases.C, t, t, np.array(reaction), {}, None)).axes[0]
+    assert axes.get_ylabel() == f"reaction on the rear face\n{unit}"
+    shown = [label.get_text() for label in axes.get_yticklabels()]
+    if labels is None:
+        assert axes.get_yscale() == "linear"
+        assert len(shown) > 3
+    else:
+        assert [text for text in shown if not text.startswith("-")] == labels
+
+
+def test_a_billet_turned_inside_out_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    """Case A without the step's limit goes on past t = 200 with rows of cells pushed through each other."""
+    assert run(cases.A, increment=10, until=220).converged
+    (record,) = (record for record in caplog.records if record.name == "extrusion.output")
+    assert "of the billet's section is turned inside out" in record.message
+    caplog.clear()
+    run(cases.A, increment=10, until=155)
+    assert "inside out" not in caplog.text
+
+
+def test_a_file_that_cannot_be_written_leaves_the_others(tmp_path: Path) -> None:
+    """What an earlier run left is removed only when all can be written anew."""
+    (tmp_path / "run.json").write_text("an earlier run")
+    (tmp_path / "contact.csv").mkdir()
+    with pytest.raises(InputError, match="cannot be written"):
+        run(cases.A, until=5, out=tmp_path)
+    assert (tmp_path / "run.json").read_text() == "an earlier run"
+
+
 def test_failed_run_keeps_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a single iteration the first increment goes, the billet being free; the next, on B-C, fails."""
     monkeypatch.setattr("extrusion.newton.Newton", partial(Newton, max_iterations=0))

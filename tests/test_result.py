@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
 
@@ -53,7 +54,8 @@ def test_json(result: Result) -> None:
     """The object of ``--json``: these keys in this order, values unrounded, all of it strict JSON."""
     text = json.dumps(result.to_dict(), allow_nan=False)
     data = json.loads(text)
-    assert " ".join(data) == "case method order die dofs contact_points ranks solver converged seconds estimate steps"
+    keys = "case method order die dofs contact_points ranks solver converged error seconds estimate steps"
+    assert " ".join(data) == keys
     assert list(data["seconds"]) == ["setup", "solve", "output", "factor", "condensation", "pairing"]
     step, last = data["steps"][-1], result.steps[-1]
     assert " ".join(step) == "t points reaction energy iterations cuts gap"
@@ -160,3 +162,39 @@ def test_ranks_do_not_matter() -> None:
         assert one["gap"] == pytest.approx(other["gap"], rel=0, abs=1e-8)
         assert one["reaction"] == pytest.approx(other["reaction"], rel=1e-6)
         assert one["iterations"] == other["iterations"]
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"mehtod": "nodal"}, "mehtod = 'nodal': no such option; choose from name, title"),
+        ({"goal": "foo"}, "goal = 'foo': choose one of K, reaction"),
+        ({"until": 240.0, "increment": 60.0}, "increments = 240.0: end before the rear face leaves the die"),
+    ],
+)
+def test_bad_options(options: dict[str, Any], told: str) -> None:
+    """What the command line cannot be asked, too, is one line."""
+    with pytest.raises(InputError) as error:
+        run(cases.A, **options)
+    assert str(error.value).startswith(told)
+
+
+def test_a_name_is_no_case() -> None:
+    with pytest.raises(InputError, match="case = 'A': give a Case"):
+        run("A")  # type: ignore[arg-type]
+
+
+def test_points_that_are_not_there(result: Result) -> None:
+    with pytest.raises(InputError, match=r"point = 'Z': choose one of .*K"):
+        result.point("Z")
+    with pytest.raises(InputError, match="gap = 'N': choose one of L, M, K"):
+        result.gap("N")
+
+
+def test_what_another_method_or_space_leaves_behind() -> None:
+    """theta is a variant of Nitsche's method alone; the sheet's figures are of the whole revolution."""
+    variant = replace(cases.A, method="nitsche", theta=-1)
+    assert changed(variant, method="mortar").theta == 0
+    assert changed(variant, order=2).theta == -1
+    assert changed(cases.A, space="plane strain").figures == ()
+    assert changed(cases.A, space="3d").figures == cases.A.figures
