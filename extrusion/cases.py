@@ -50,7 +50,8 @@ OVERLAP = 0.25
 
 def _choice(name: str, value: object, allowed: tuple[object, ...]) -> None:
     if not any(type(value) is type(one) and value == one for one in allowed):  # 1.0 and true are no 1
-        raise InputError(name, value, f"choose one of {', '.join(map(str, allowed))}")
+        named = [str(one) for one in allowed if one is not None]
+        raise InputError(name, value, f"choose one of {', '.join(named)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +169,7 @@ class Case:
                     f"must be at most half the billet's length, {self.profile.length / 2:g} mm",
                 )
         if not self.zones:
-            raise InputError("zones", (), "give at least one contact zone")
+            raise InputError("zones", (), "give at least one contact zone, [[zones]] with name, billet, die and ray")
         names = [zone.name for zone in self.zones]
         if len(set(names)) < len(names):
             raise InputError("zones", names, "zone names must differ")
@@ -340,14 +341,16 @@ def from_dict(data: Mapping[str, Any]) -> Case:
                     raise InputError(f"{at}.{error.field}", error.value, error.remedy) from None
                 raise
     if materials:
-        raise InputError(f"materials.{next(iter(materials))}", "?", "unknown key; materials are billet and die")
+        key, value = next(iter(materials.items()))
+        raise InputError(f"materials.{key}", value, "unknown key; materials are billet and die")
     if "profile" in data:
         values["profile"] = Profile.from_dict(_mapping("profile", data.pop("profile")))
     for key, kind in (("zones", Zone), ("figures", Figure)):
         rows = data.pop(key, [])
         if not isinstance(rows, list | tuple):
             raise InputError(key, rows, f"give a list of tables, [[{key}]]")
-        values[key] = tuple(_build(kind, key, _mapping(key, row)) for row in rows)
+        tables = [_mapping(key, row) for row in rows]
+        values[key] = tuple(_build(kind, f"{key}.{row.get('name', i)}", row) for i, row in enumerate(tables, 1))
     if "increments" in data:
         rows = data.pop("increments")
         if not isinstance(rows, list):
@@ -377,7 +380,7 @@ def _build(
             raise InputError(dot + key, value, f"unknown key; the keys here are {', '.join(keys)}")
     for name, f in fields.items():
         if name not in table and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
-            raise InputError(dot + name, None, "is missing")
+            raise InputError(dot + name, None, "is missing: give it a value")
     return kind(**table)
 
 

@@ -223,9 +223,9 @@ def choose_model(case: Case, tolerance: float, goal: Goal, comm: MPI.Intracomm) 
                     *by_symmetry,
                     *zone_parts,
                     *([Part("rigid instead of elastic die", is_rigid, die)] if elastic else []),
-                    Part("linear instead of quadratic elements", order == 1, by_order),
+                    Part(f"linear instead of quadratic elements, {sizes[1]:g} mm", order == 1, by_order),
                     *(
-                        Part(f"size {h:g} mm", order == 2 and h == size, one)
+                        Part(f"quadratic elements, {h:g} mm", order == 2 and h == size, one)
                         for h, one in zip(sizes, by_size, strict=False)
                     ),
                 ]
@@ -235,7 +235,9 @@ def choose_model(case: Case, tolerance: float, goal: Goal, comm: MPI.Intracomm) 
         left = len(sizes) - 1 - level
         reachable = by_size[-1].of(goal) / 2 ** (RATE * left)
         if reachable > tolerance:
-            remedy = f"the finest mesh that is tried ({sizes[-1]:g} mm) is expected to reach {reachable:.1e}: give more"
+            remedy = (
+                f"{sizes[-1]:g} mm, the finest mesh that is tried, is expected to reach {reachable:.1e}: give no less"
+            )
             raise InputError("tolerance", tolerance, remedy)
         _tell(comm, "%g mm: estimated error of %s %.1e; the next mesh", sizes[level], goal, by_size[-1].of(goal))
     raise InputError("tolerance", tolerance, f"{sizes[-1]:g} mm, the finest mesh that is tried, does not reach it")

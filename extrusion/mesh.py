@@ -287,6 +287,10 @@ def grid(r: Array, y: Array, first: int = 0) -> tuple[Array, Indices, dict[str, 
     )
 
 
+MOST_FACETS = 5000
+"""Facets along the billet's side, at most."""
+
+
 def graded_mesh(profile: Profile, size: float) -> PlainMesh:
     """Mesh of element size h = `size` (mm) that is fine where contact is, by gmsh.
 
@@ -296,12 +300,12 @@ def graded_mesh(profile: Profile, size: float) -> PlainMesh:
     die, which is stiff: at h = 1 that costs 5e-5 of the die's strain energy, itself a small part of the whole.
 
     Raises:
-        InputError: If the size is not within radius/1000 and radius, or gmsh is missing.
+        InputError: If the size is not within radius/1000 (or length/`MOST_FACETS`) and radius, or gmsh is missing.
     """
     if isinstance(size, bool) or not isinstance(size, int | float) or not math.isfinite(size):
         raise InputError("size", size, "give the element size as a number, mm")
-    if not profile.radius / 1000 <= size <= profile.radius:
-        least, most = profile.radius / 1000, profile.radius
+    least, most = max(profile.radius / 1000, profile.length / MOST_FACETS), profile.radius
+    if not least <= size <= most:
         raise InputError("size", size, f"give an element size between {least:g} and {most:g} mm")
     edges = profile.edges
     contact = edges["bore"] + edges["cone"]
@@ -368,10 +372,12 @@ def _gmsh() -> Iterator[Any]:
     try:
         import gmsh
     except ImportError:
-        raise InputError("gmsh", "not installed", "pip install gmsh, or take a bundled mesh") from None
+        raise InputError(
+            "gmsh", "not installed", "pip install gmsh; the bundled meshes are of SSNV504's profile alone"
+        ) from None
     except OSError as error:
         packages = "libglu1-mesa libgl1 libxcursor1 libxinerama1 libxft2 libgomp1"
-        raise InputError("gmsh", str(error), f"apt-get install {packages}, or take a bundled mesh") from None
+        raise InputError("gmsh", str(error), f"apt-get install {packages}") from None
     gmsh.initialize(readConfigFiles=False, interruptible=False)
     try:
         gmsh.option.setNumber("General.Terminal", 0)
@@ -556,7 +562,7 @@ def check_profile(mesh: PlainMesh, profile: Profile) -> None:
         edges = ", ".join(f"{p}-{q}" for p, q in profile.edges[group])
         if np.any(off > tolerance):
             at = tuple(round(v, 6) for v in np.mean(x[np.argmax(off)], axis=0).tolist())
-            raise InputError("mesh", f"{group} at {at}", f"lies off the profile's {edges}")
+            raise InputError("mesh", f"{group} at {at}", f"lies off the profile's {edges} (both in mm)")
         covered = np.sum(np.linalg.norm(x[:, 1] - x[:, 0], axis=1))
         missing = float(np.sum(np.linalg.norm(d, axis=-1)) - covered)
         if abs(missing) > tolerance * (len(facets) + 1):

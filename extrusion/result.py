@@ -233,13 +233,13 @@ class Result:
         rows = []
         for step in (self.steps[i] for i in chosen):
             K = step.points["K"][1]
-            row = [f"{step.t:g}", f"{K:.3f}", *([f"{e.error.K * abs(K):.1g}"] if e else [])]
+            row = [f"{step.t:g}", f"{K:.3f}", *([_rough(e.error.K * abs(K))] if e else [])]
             if figures:
                 c = figures.get(step.t)
                 row += ["", ""] if c is None else [f"{c.figure.value:.3f}", f"{100 * c.difference:+.3f}"]
             row += [_fixed(step.reaction / 1e3, 2)]
             bar = e.error.reaction * max(e.reaction_scale, abs(step.reaction)) / 1e3 if e else 0.0
-            row += [f"{bar:.1g}" if e else _fixed(step.energy / 1e3, 2)]
+            row += [_rough(bar) if e else _fixed(step.energy / 1e3, 2)]
             row += [_fixed(step.gap[name], 3) for name in gaps]
             rows.append([*row, str(step.iterations), str(step.cuts)])
         return header, rows
@@ -265,6 +265,10 @@ def per_thickness(case: Case) -> str:
 
 def _fixed(value: float, digits: int) -> str:
     return f"{round(value, digits) + 0.0:.{digits}f}"  # no -0.000
+
+
+def _rough(value: float) -> str:
+    return f"{float(f'{value:.1g}'):g}"  # 50, not 5e+01
 
 
 def _finite(value: float) -> float | None:

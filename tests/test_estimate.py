@@ -78,7 +78,7 @@ def test_the_cheapest_model_that_is_good_enough() -> None:
     assert better.error.K < 5e-4
     taken = {part.name: part.taken for part in estimate.parts}
     assert taken["rigid instead of elastic die"]
-    assert not taken["linear instead of quadratic elements"]
+    assert not taken["linear instead of quadratic elements, 4 mm"]
     assert any("no zone 2" in name for name in taken)
 
 
