@@ -69,17 +69,6 @@ def test_toml_and_back(case: Case, tmp_path: Path) -> None:
     assert cases.read_toml(path) == case
 
 
-def test_the_readmes_scene(tmp_path: Path) -> None:
-    """Its file and its Python are the same case, and one that can be solved (the billet's side lies in the bore)."""
-    text = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    blocks = {kind: text.split(f"```{kind}\n")[-1].split("```")[0] for kind in ("toml", "python")}
-    (tmp_path / "wire.toml").write_text(blocks["toml"], encoding="utf-8")
-    scope: dict[str, Any] = {}
-    exec(blocks["python"].split("result =")[0], scope)
-    assert cases.read_toml(tmp_path / "wire.toml") == scope["wire"]
-    assert scope["wire"].profile.overlap == 0
-
-
 @pytest.mark.parametrize(
     ("path", "value", "field"),
     [
