@@ -64,6 +64,12 @@ class Surface:
         return np.asarray(along[first])
 
     @cached_property
+    def node_positions(self) -> Array:
+        """Reference positions of `node_numbers`, ``shape=(n, 2)``, mm."""
+        number, first = np.unique(self.nodes, return_index=True)
+        return np.asarray(self.X.reshape(-1, 2)[first[np.searchsorted(number, self.node_numbers)]])
+
+    @cached_property
     def gradients(self) -> Array:
         """Gradients of the cell's functions along the facet, by powers of xi, 1/mm: ``shape=(m, k - 1, K, 2)``."""
         assert self.tabulate is not None
@@ -440,12 +446,6 @@ def closest_rows(
     weights = np.concatenate([N, -M], axis=1)
     G = (weights[:, :, None] * pair.normal[:, None]).reshape(len(x_s), -1)
     return pair, gap, G, _dofs(np.concatenate([slave_nodes, die.nodes[pair.facet]], axis=1))
-
-
-def polyline_points(die: Surface) -> Array:
-    """Reference positions of `Surface.node_numbers`, ``shape=(m + 1, 2)``, mm."""
-    number, first = np.unique(die.nodes, return_index=True)
-    return np.asarray(die.X.reshape(-1, 2)[first[np.searchsorted(number, die.node_numbers)]])
 
 
 def ray_gap(x: Array, die: Surface, z: Array, axis: int, sign: float) -> tuple[Array, Array, Index, Array]:

@@ -22,7 +22,6 @@ from extrusion.gap import (
     closest_rows,
     gauss,
     least_gap,
-    polyline_points,
     ray_gap,
     ray_points,
     shape,
@@ -232,7 +231,7 @@ class CurvePair(Pair):
 
     @property
     def X(self) -> Array:
-        return polyline_points(self.slave)
+        return self.slave.node_positions
 
     def at_nodes(self, z: Array, keep: Index | None = None, which: Index | slice = slice(None)) -> NodeRows:
         nodes = self.nodes[which]

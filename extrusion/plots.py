@@ -221,7 +221,7 @@ def history(record: Record) -> Figure:
             t, value, tolerance, fmt="o", mfc="none", color="C3", capsize=3, label="sheet, with its tolerance"
         )
         bottom.legend(frameon=False)
-    bottom.set(xlabel="t, displacement of the rear face [mm]", ylabel="u$_y$(K) - t [mm]")
+    bottom.set(xlabel="t, displacement of the rear face [mm]", ylabel="u_y(K) - t [mm]")
     for ax in (top, bottom):
         ax.grid(alpha=0.25)
         ax.margins(x=0.02)
