@@ -46,24 +46,24 @@ MOST = 1e-2
 
 
 class Krylov:
-    """The tangent of a problem as PETSc's matrix, and its preconditioner.
+    """What PETSc's matrix of the tangent does, and its preconditioner.
+
+    It holds neither that matrix nor the problem: PETSc holds it in C, where no garbage collector looks.
 
     Args:
         problem: Whose bulk it is. Displacements and multipliers only, no pressures.
     """
 
     def __init__(self, problem: Problem) -> None:
-        self._problem = weakref.proxy(problem)  # PETSc holds this object in C
-        comm, x = problem.comm, problem.x
-        self.A = PETSc.Mat().createPython((x.sizes, x.sizes), context=self, comm=comm)
-        self.A.setUp()
+        self._problem = weakref.proxy(problem)
+        x = problem.x
         self._bodies = [_Multigrid(problem, A, rows) for A, rows in problem.bulk()]
         self._z = x.duplicate()
         self._of_billet = np.isin(problem.x_rows, self._bodies[0].rows)
         self._stiff: Triplets | None = None
         self._fresh = False  # the billet's multigrid knows the contact of now
 
-    def set(self, D: Triplets, stiff: Triplets, kappa: Array) -> PETSc.Mat:
+    def set(self, D: Triplets, stiff: Triplets, kappa: Array) -> None:
         """Take contact's derivative, its symmetric stiffness of the billet and kappa of each multiplier. Collective.
 
         The derivative in this rank's rows, or in all if there are multipliers.
@@ -90,8 +90,6 @@ class Krylov:
         known, self._stiff = self._stiff, stiff
         same = known is not None and all(np.array_equal(a, b) for a, b in zip(stiff, known, strict=True))
         self._fresh &= problem.agreed(same)
-        self.A.assemble()
-        return self.A
 
     def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The tangent by a vector that is zero at the supports."""

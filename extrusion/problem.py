@@ -459,7 +459,9 @@ class Problem(System):
             D = self.contact_tangent(z, geometric, wanted, self.z_free)
             stiff = [term.stiff(z, self._z_of_billet) for term in self.terms]
             kappa = np.concatenate([part for _, part in stiff])
-            return self._krylov.set(D, joined([part for part, _ in stiff]), kappa)
+            self._krylov.set(D, joined([part for part, _ in stiff]), kappa)
+            self._iterated.assemble()
+            return self._iterated
         rows, cols, values = self.contact_tangent(z, geometric, self._z_row, self.z_free)
         return self._tangent.fill(self.z_to_x[rows] - self._row0, self.z_to_x[cols], values)
 
@@ -496,6 +498,8 @@ class Problem(System):
         from extrusion.krylov import Krylov
 
         self._krylov = Krylov(self)
+        self._iterated = PETSc.Mat().createPython((self.x.sizes, self.x.sizes), context=self._krylov, comm=self.comm)
+        self._iterated.setUp()
 
     def agreed(self, yes: bool) -> bool:
         """Whether all ranks say yes."""
@@ -558,7 +562,7 @@ class Problem(System):
     def tangent_without_contact(self) -> PETSc.Mat:
         """The bulk's tangent, with identity at the supports (and nothing yet for the multipliers)."""
         if self._krylov is not None:
-            return self._krylov.A
+            return self._iterated
         none = np.zeros(0, dtype=np.int64)
         return self._tangent.fill(none, none, np.zeros(0))
 
