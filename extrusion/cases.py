@@ -48,10 +48,16 @@ OVERLAP = 0.25
 """How deep the billet may stand in the die at t = 0, by its radius; deeper, the scene is wrong."""
 
 
-def _choice(name: str, value: object, allowed: tuple[object, ...]) -> None:
-    if not any(type(value) is type(one) and value == one for one in allowed):  # 1.0 and true are no 1
-        named = [str(one) for one in allowed if one is not None]
-        raise InputError(name, value, f"choose one of {', '.join(named)}")
+def _choose(of: object, at: str = "", **allowed: tuple[object, ...]) -> None:
+    """Refuse what is not allowed in fields of a frozen value; 1.0 and true are no 1, but NumPy's 1 is one."""
+    for name, values in allowed.items():
+        value = getattr(of, name)
+        boolean = type(value).__name__.startswith("bool")
+        found = [one for one in values if value == one and boolean == isinstance(one, bool)]
+        if isinstance(value, float) or not found:
+            named = [str(one) for one in values if one is not None]
+            raise InputError(at + name, value, f"choose one of {', '.join(named)}")
+        object.__setattr__(of, name, found[0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,16 +76,13 @@ class Zone:
 
     def __post_init__(self) -> None:
         at = f"zones.{self.name}."
-        if not isinstance(self.name, str) or not self.name:
+        if not isinstance(self.name, str) or not self.name or not self.name.isprintable():
             raise InputError("zones.name", self.name, "give the zone a name")
-        _choice(at + "billet", self.billet, ("side", "front"))
-        _choice(at + "die", self.die, ("bore", "cone"))
-        _choice(at + "ray", self.ray, ("r", "y"))
-        _choice(at + "contact", self.contact, CLOSURES)
-        _choice(at + "slave", self.slave, ("billet", "die"))
-        _choice(at + "gap", self.gap, ("ray", "closest", None))
-        _choice(at + "smooth", self.smooth, (False, True))
-        _choice(at + "initial", self.initial, ("touching", "interpenetrating"))
+        _choose(
+            self, at, billet=("side", "front"), die=("bore", "cone"), ray=("r", "y"), contact=CLOSURES,
+            slave=("billet", "die"), gap=("ray", "closest", None), smooth=(False, True),
+            initial=("touching", "interpenetrating"),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,8 +102,7 @@ class Figure:
         _number("figures.t", self.t, 0.0, "give a positive t in mm")
         _number("figures.value", self.value)
         _number("figures.tolerance", self.tolerance, -1e-300, "give a relative tolerance, not below 0")
-        _choice("figures.quantity", self.quantity, ("u_y", "gap", "open"))
-        _choice("figures.contact", self.contact, ("solved", "check"))
+        _choose(self, "figures.", quantity=("u_y", "gap", "open"), contact=("solved", "check"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,12 +141,11 @@ class Case:
             raise InputError("name", self.name, "give the case a name that can name a folder")
         if not isinstance(self.title, str):
             raise InputError("title", self.title, "give a text")
-        _choice("method", self.method, METHODS)
-        _choice("order", self.order, (1, 2))
-        _choice("theta", self.theta, (-1, 0, 1))
-        _choice("die", self.die, ("elastic", "rigid"))
-        _choice("space", self.space, ("axisymmetric", "plane strain", "3d"))
-        _choice("element", self.element, ("lagrange", "serendipity"))
+        _choose(
+            self, method=METHODS, order=(1, 2), theta=(-1, 0, 1), die=("elastic", "rigid"),
+            space=("axisymmetric", "plane strain", "3d"), element=("lagrange", "serendipity"),
+            form=("displacement", "mixed", None),
+        )  # fmt: skip
         if self.element == "serendipity" and (self.space != "3d" or self.order != 2):
             raise InputError("element", "serendipity", "is the 20-node hexahedron: needs space = '3d' and order 2")
         if self.space != "3d":
@@ -153,9 +154,8 @@ class Case:
                     raise InputError(name, getattr(self, name), "leave it out: it is for space = '3d'")
         remedy = "give a distance in mm, of either sign"
         object.__setattr__(self, "off_symmetry", _number("off_symmetry", self.off_symmetry, -math.inf, remedy))
-        if self.theta and self.method != "nitsche":
-            raise InputError("theta", self.theta, "leave it out: it is a variant of method = 'nitsche'")
-        _choice("form", self.form, ("displacement", "mixed", None))
+        if self.form == "mixed" and self.billet.nu <= 0:
+            raise InputError("form", "mixed", f"the pressure is divided by nu, here {self.billet.nu:g}: leave it out")
         if self.form == "mixed" and self.order == 1:
             raise InputError("form", "mixed", "needs order 2 (Taylor-Hood: quadratic displacement, linear pressure)")
         if self.gamma is not None:
@@ -170,6 +170,9 @@ class Case:
                 )
         if not self.zones:
             raise InputError("zones", (), "give at least one contact zone, [[zones]] with name, billet, die and ray")
+        for one in self.zones:
+            if not isinstance(one, Zone):
+                raise InputError("zones", one, "give each as extrusion.cases.Zone, or a table [[zones]]")
         names = [zone.name for zone in self.zones]
         if len(set(names)) < len(names):
             raise InputError("zones", names, "zone names must differ")
@@ -200,9 +203,10 @@ class Case:
             table.append((step, until))
         object.__setattr__(self, "increments", tuple(table))
         for figure in self.figures:
-            if figure.point not in self.profile.points:
-                known = ", ".join(self.profile.points)
-                raise InputError("figures.point", figure.point, f"name a point of the profile: {known}")
+            points = ("K", "L", "M") if figure.quantity == "gap" else tuple(self.profile.points)
+            if figure.point not in points:
+                known = ", ".join(points)
+                raise InputError("figures.point", figure.point, f"name one of {known}")
 
     def _check_ray(self, zone: Zone) -> None:
         """Refuse a master that is no graph along the zone's ray, and a billet deep in the die."""
@@ -215,17 +219,17 @@ class Case:
                 flat = (zone.billet, zone.ray) not in (("side", "r"), ("front", "y"))
             if flat:
                 of = zone.die if zone.slave == "billet" else zone.billet
-                other = "y" if zone.ray == "r" else "r"
-                raise InputError(
-                    f"zones.{zone.name}.ray",
-                    zone.ray,
-                    f"meets the {of} along it, or twice: take {other!r}, or another gap",
-                )
-        if profile.overlap > OVERLAP * profile.radius and zone.contact != "check":
-            remedy = (
-                f"the billet stands {profile.overlap:g} mm deep in the die at t = 0: give at most {OVERLAP:g} of it"
-            )
-            raise InputError("profile.radius", profile.radius, remedy)
+                remedy = f"that way it meets the {of} along its length, or twice: take the other, or gap = 'closest'"
+                raise InputError(f"zones.{zone.name}.ray", zone.ray, remedy)
+        overlap = self.overlap(zone)
+        if overlap > OVERLAP * profile.radius:
+            size = f"radius {profile.radius:g}, length {profile.length:g}"
+            remedy = f"the billet ({size}) is {overlap:g} mm deep in it at t = 0: let that be {OVERLAP:g} of the radius"
+            raise InputError(f"zones.{zone.name}.die", zone.die, remedy)
+
+    def overlap(self, zone: Zone) -> float:
+        """How deep the billet stands in a zone's die at t = 0, mm; 0 where contact is only checked."""
+        return 0.0 if zone.contact == "check" else self.profile.overlap(zone.billet, getattr(self.profile, zone.die))
 
     @property
     def end(self) -> float:
@@ -248,7 +252,7 @@ class Case:
     def mesh_size(self) -> float | None:
         """Element size in force, mm; None where the profile's divisions count."""
         if self.size is None and not self.profile.divisions:
-            return self.profile.radius / 25
+            return max(self.profile.radius / 25, self.profile.length / 1000)
         return self.size
 
     @property

@@ -14,6 +14,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -413,7 +414,10 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
     except typer.Abort:
         _say("interrupted")
         sys.exit(INTERRUPTED)
-    except Exception:
+    except Exception as error:
+        if _by_interrupt(error):  # in a callback of PETSc
+            _say("interrupted")
+            sys.exit(INTERRUPTED)
         MPI = getattr(sys.modules.get("mpi4py.MPI"), "COMM_WORLD", None)
         if MPI is None or MPI.size == 1:
             raise
@@ -426,27 +430,36 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
 class _Interrupt:
     """Ctrl-C while a case runs: the first one lets the step in hand end, and its files be written; the next ends all.
 
-    An observer. Before there is an accepted step the first one ends all: a rank that raised an exception would leave
-    the others waiting for it.
+    An observer. Before there is an accepted step the first one ends all. On several ranks that is by force: one that
+    raised an exception would leave the others waiting for it.
     """
 
     def __init__(self) -> None:
         self.stopped, self._heard, self._may_stop = False, 0, False
+        # a job that was started to ignore Ctrl-C, or a thread, is left as it is
+        main = threading.current_thread() is threading.main_thread()
+        self._hears = main and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
 
     def __enter__(self) -> _Interrupt:
-        self._before = signal.signal(signal.SIGINT, lambda *_: self._hear())
+        if self._hears:
+            self._before = signal.signal(signal.SIGINT, lambda *_: self._hear())
         return self
 
     def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGINT, self._before)
+        if self._hears:
+            signal.signal(signal.SIGINT, self._before)
 
     def _hear(self) -> None:
         self._heard += 1
-        if self._heard > 1 or not self._may_stop:
-            _say("interrupted")
-            sys.stderr.flush()
-            os._exit(INTERRUPTED)
-        _say("interrupted: stops after this step (again: at once)")
+        if self._heard == 1 and self._may_stop:
+            _say("interrupted: stops after this step (again: at once)")
+            return
+        if sys.modules["mpi4py.MPI"].COMM_WORLD.size == 1:
+            raise KeyboardInterrupt
+        if _rank() == 0:  # past the progress bar, which has hidden the cursor
+            show = "\x1b[?25h" if os.isatty(2) else ""
+            os.write(2, f"{show}extrusion: interrupted\n".encode())
+        os._exit(INTERRUPTED)
 
     def __call__(self, problem: Problem, step: Step) -> None:
         """Stop if any rank has been told to. Collective."""
@@ -460,6 +473,12 @@ def _say(message: str) -> None:
     """One line on stderr, from rank 0."""
     if message and _rank() == 0:
         print("extrusion:", " ".join(message.split()), file=sys.stderr)
+
+
+def _by_interrupt(error: BaseException | None) -> bool:
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _rank() -> int:

@@ -78,7 +78,7 @@ def choose(problem: Problem, solver: str = "auto") -> System:
     chosen = "surface" if solver == "surface" else min(allowed, key=allowed.__getitem__)
     if problem.comm.rank == 0:
         log.info(
-            "solver %s: the forces of contact take up to %.2g MB on the surface%s; estimated %s",
+            "solver %s: the forces of contact take up to %.3g MB on the surface%s; estimated %s",
             chosen,
             surface_memory(problem) / 1e6,
             "" if fits else ", too many here",

@@ -203,7 +203,7 @@ def history(record: Record) -> Figure:
         top.set_yscale("symlog", linthresh=linear)
         top.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
         top.minorticks_off()
-    if peak < 1e-9 * record.case.billet.E * record.case.profile.radius**2:  # round-off
+    if peak < 1e-6:  # N: less than the residual that Newton's method leaves
         top.set_ylim(-1, 1)
     top.set_ylabel(f"reaction on the rear face\n{unit_name}")
     bottom.axhline(0, color="0.6", linewidth=0.8)
@@ -231,7 +231,8 @@ def history(record: Record) -> Figure:
 def _linear_part(force: Array) -> float:
     """Up to where an axis is linear: all of it, unless a few values are far larger than the rest."""
     size = np.abs(force)
-    usual = float(np.quantile(size, 0.75))
+    acts = size > 1e-3 * size.max()  # else the billet moves freely
+    usual = float(np.quantile(size[acts], 0.6)) if acts.any() else 0.0
     if not 0.0 < 8 * usual < size.max():
         return float(size.max())
     decade = 10.0 ** np.floor(np.log10(usual))

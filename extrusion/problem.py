@@ -86,12 +86,15 @@ class Problem(System):
             log.warning("20-node hexahedra under nodal pressure: its vertices pull, use nitsche or mortar")
         if case.space == "3d" and case.order == 1 and case.method != "nodal" and comm.rank == 0:
             log.warning("order = 1 in 3D: facets are chords of the circle, and contact holds these: use order 2")
-        overlap = case.profile.overlap
+        overlap = max(case.overlap(zone) for zone in case.zones)
         if overlap > CLOSED_GAP * case.profile.radius and comm.rank == 0:
             log.warning("the billet stands up to %.3g mm deep in the die at t = 0: an interference fit", overlap)
         billet_slave = any(zone.slave == "billet" and zone.contact != "check" for zone in case.zones)
         if case.die == "elastic" and case.die_material.E < case.billet.E and billet_slave and comm.rank == 0:
-            log.warning('the die is softer than the billet: let it be the slave (slave = "die"), or steps may fail')
+            other = "" if case.method != "mortar" else " and the method nitsche"
+            log.warning(
+                'the die is softer than the billet: let it be slave (slave = "die")%s, or steps may fail', other
+            )
         bodies = ("billet", "die") if case.die == "elastic" else ("billet",)
         self.tagged: TaggedMesh = _distributed(case, mesh, comm, bodies)
         self.bodies = bodies

@@ -147,21 +147,24 @@ class Profile:
         radius: Array = r[i] + (r[i + 1] - r[i]) * (y - s[i]) / (s[i + 1] - s[i])
         return radius
 
-    @property
-    def overlap(self) -> float:
-        """How deep the billet stands in the die at t = 0, mm: its side in the bore, or its front in the cone."""
-        bore, cone = self.curve(self.bore), self.curve(self.cone)
-        low, high = max(bore[:, 1].min(), 0.0), min(bore[:, 1].max(), self.length)
-        deepest = 0.0
-        if low < high and len(set(np.sign(np.diff(bore[:, 1])))) == 1:  # else it is no graph
-            at = [low, high, *(y for y in bore[:, 1] if low < y < high)]
-            deepest = max(0.0, float(np.max(self.radius - self.bore_radius(at))))
-        if len(cone):
-            r, y = cone[np.argsort(cone[:, 0], kind="stable")].T
-            rim = np.clip(self.radius, r[0], r[-1])
-            lowest = min(np.interp(rim, r, y), np.min(y[r < rim], initial=np.inf))
-            deepest = max(deepest, float(self.length - lowest) if self.radius > r[0] else 0.0)
-        return deepest
+    def overlap(self, billet: str, die: Sequence[str]) -> float:
+        """How deep the billet stands in a part of the die at t = 0, mm; 0 where that is no graph over its edge.
+
+        Args:
+            billet: "side", whose depth is radial, or "front", axial.
+            die: Consecutive die vertices.
+        """
+        across, along, edge, most = (
+            (0, 1, self.radius, self.length) if billet == "side" else (1, 0, self.length, self.radius)
+        )
+        curve = self.curve(die)
+        p, c = curve[np.argsort(curve[:, along], kind="stable")].T[[along, across]]
+        low, high = max(float(p[0]), 0.0), min(float(p[-1]), most)
+        rising = np.diff(curve[:, along])
+        if low >= high or not (np.all(rising > 0) or np.all(rising < 0)):
+            return 0.0
+        at = np.array([low, high, *p[(p > low) & (p < high)]])
+        return max(0.0, float(np.max(edge - np.interp(at, p, c))))
 
     def division(self, a: str, b: str) -> int:
         """Divisions of the edge a-b, named either way round.

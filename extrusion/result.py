@@ -68,8 +68,8 @@ class Comparison:
 
     @property
     def difference(self) -> float:
-        """Relative to the sheet's value."""
-        return (self.computed - self.figure.value) / abs(self.figure.value)
+        """Relative to the sheet's value, if that is not 0."""
+        return (self.computed - self.figure.value) / (abs(self.figure.value) or 1.0)
 
     @property
     def ok(self) -> bool:
@@ -247,7 +247,7 @@ class Result:
 
 def _named[T](what: str, name: str, values: Mapping[str, T]) -> T:
     if name not in values:
-        raise InputError(what, name, f"choose one of {', '.join(values)}")
+        raise InputError(what, name, f"choose one of {', '.join(values)}" if values else "the run has none")
     return values[name]
 
 
@@ -304,9 +304,9 @@ def changed(case: Case, **changes: Any) -> Case:
         changes["mesh"] = None
     if changes.get("space", case.space) != case.space:
         changes = {"mesh": None, "sectors": None, "element": "lagrange", **changes}
-    if changes.get("method", case.method) != "nitsche" and case.theta:
-        changes = {"theta": 0, **changes}  # it is a variant of that
-    if changes.get("space") == "plane strain":
+    if changes.get("theta") and changes.get("method", case.method) != "nitsche":
+        raise InputError("theta", changes["theta"], "leave it out: it is a variant of method = 'nitsche'")
+    if changes.get("space", case.space) == "plane strain" != case.space:
         changes = {"figures": (), **changes}  # which are of the whole revolution
     fields = [f.name for f in dataclasses.fields(Case)]
     for name, value in changes.items():
@@ -366,8 +366,7 @@ def run(
     from extrusion.problem import Problem
     from extrusion.stepping import steps
 
-    if not isinstance(case, Case):
-        raise InputError("case", case, "give a Case: extrusion.cases.A, or extrusion.cases.read_toml(FILE)")
+    _refuse_other(case)
     if solver not in SOLVERS:
         raise InputError("solver", solver, f"choose one of {', '.join(SOLVERS)}")
     if goal not in ("K", "reaction"):
@@ -377,7 +376,7 @@ def run(
     plain = None if isinstance(mesh, str | Path) else mesh
     case = changed(case, mesh=given, **changes)
     top = max(y for _, _, y in case.profile.die)
-    if case.end > top:
+    if case.end > top and any(zone.contact != "check" for zone in case.zones):
         remedy = f"end before the rear face leaves the die, which ends at y = {top:g} mm"
         raise InputError("increments", case.end, remedy)
     if solver == "iterative" and (case.space != "3d" or case.mixed):
@@ -451,6 +450,11 @@ def run(
     return result
 
 
+def _refuse_other(case: object) -> None:
+    if not isinstance(case, Case):
+        raise InputError("case", case, "give a Case: extrusion.cases.A, or extrusion.cases.read_toml(FILE)")
+
+
 def _gone() -> Any:
     raise RuntimeError("the field of a step is gone once the run is over: take it in an observer")
 
@@ -463,7 +467,7 @@ def _figure(figure: Figure, step: Step) -> float:
         closed = next(iter(step.zones.values())).closed  # in order from M
         opened = int(np.argmax(closed)) if closed.any() else len(closed)
         return float(opened) if closed[opened:].all() else -1.0
-    return step.points[figure.point][1]
+    return step.points.get(figure.point, (math.nan, math.nan))[1]
 
 
 def _mesh(comm: MPI.Intracomm, case: Case, given: PlainMesh | HexMesh | None) -> PlainMesh | HexMesh | None:
@@ -522,9 +526,10 @@ def verify(case: Case, **options: Any) -> list[Result]:
     Raises:
         InputError: The case has no figures, or what `run` raises.
     """
+    _refuse_other(case)
     if not case.figures:
         raise InputError("figures", [], f"case {case.name} has none to verify")
-    times = case.times()
+    times = changed(case, **{name: options.get(name) for name in ("increment", "until")}).times()
     for figure in case.figures:
         if not any(math.isclose(t, figure.t, rel_tol=1e-9) for t in times):
             raise InputError(

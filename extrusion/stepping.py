@@ -111,8 +111,12 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
             outcome = _increment(problem, newton, accepted, dt / last if last else 1.0)
             iterations += outcome.iterations
             if outcome.converged:
+                try:
+                    states = problem.accept(x)
+                except ArithmeticError as error:
+                    outcome = replace(outcome, converged=False, reason=str(error))
+            if outcome.converged:
                 t, passes, last = goal, outcome.passes, dt
-                problem.accept(x)
                 for zone, distance in _caught(problem, t).items():
                     caught[zone] = max(distance, caught[zone])
                 rate.waxpy(-1.0, accepted, x)
@@ -132,7 +136,6 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
                     f"{outcome.remedy or _remedy(problem.case)}"
                 )
             log.info("t = %.6g mm: %s; %s; cut to %.3g mm", goal, outcome.reason, place, dt)
-        z = problem.gather(x)
         rear, die = problem.reactions(x)
         yield Step(
             t=t,
@@ -146,7 +149,7 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
             residual=outcome.residual,
             gap=problem.point_gaps(x),
             caught=caught,
-            zones={term.pair.name: term.state(z) for term in problem.terms},
+            zones=states,
             recover=lambda: problem.recover(x),
         )
         caught = dict.fromkeys(caught, 0.0)
@@ -155,7 +158,9 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
 def _remedy(case: Case) -> str:
     """What else may solve a step."""
     if case.method in ("nitsche", "mortar") and case.order == 2:
-        other = "mortar" if case.method == "nitsche" else "nitsche"
+        other = "nitsche" if case.method == "mortar" else "mortar"
+        if other == "mortar" and any(zone.slave == "die" for zone in case.zones):  # which it does not know
+            return "Try another --increment or a finer mesh"
         return f"Try another --increment, a finer mesh, or --method {other}"
     return "Try another --increment, a finer mesh, or --method nitsche or mortar on P2"
 
@@ -247,21 +252,34 @@ def _led(problem: System, newton: Newton, ahead: float) -> Outcome:
     predicted, reached = x.duplicate(), x.duplicate()
     x.copy(predicted)
     at, ratio, iterations = 0.0, STIFFEN, 0
-    while True:
-        goal = max(soft, ratio * at) if at < np.inf else gamma
-        if goal > gamma / np.sqrt(ratio):  # no further solve for a ratio as small as that
-            goal = gamma
-        problem.soften(goal / gamma)
-        outcome = newton.solve(x, ahead=None if 0.0 < at < np.inf else ahead, share=0.0 if goal == gamma else LED)
-        iterations += outcome.iterations
-        if goal == gamma and (outcome.converged or at in (0.0, np.inf)):
-            return replace(outcome, iterations=iterations)
-        if outcome.converged:
-            at = goal
-            x.copy(reached)
-        elif at and ratio > LEAST:
-            ratio **= 0.5
-            reached.copy(x)
-        else:
-            at = np.inf
-            predicted.copy(x)
+
+    def following(at: float) -> float:
+        goal = max(soft, ratio * at)
+        return gamma if goal > gamma / np.sqrt(ratio) else goal  # no further solve for a ratio as small as that
+
+    try:
+        while True:
+            goal = following(at)
+            problem.soften(goal / gamma)
+            outcome = newton.solve(x, ahead=None if at else ahead, share=0.0 if goal == gamma else LED)
+            iterations += outcome.iterations
+            if outcome.converged:
+                if goal == gamma:
+                    break
+                at = goal
+                x.copy(reached)
+                continue
+            while at and ratio > LEAST and following(at) >= goal:
+                ratio **= 0.5
+            if at and following(at) < goal:
+                reached.copy(x)
+                continue
+            if goal < gamma or at:  # at once
+                predicted.copy(x)
+                problem.soften(1.0)
+                outcome = newton.solve(x, ahead=ahead)
+                iterations += outcome.iterations
+            break
+    finally:
+        problem.soften(1.0)
+    return replace(outcome, iterations=iterations)

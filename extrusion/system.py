@@ -16,6 +16,7 @@ import numpy as np
 
 from extrusion.cases import Case
 from extrusion.gap import Array, Index
+from extrusion.pairs import ContactState
 from extrusion.zones import ContactTerm, MortarContact, Triplets
 
 
@@ -160,12 +161,19 @@ class System(ABC):
         z = self.gather(x)
         return all(term.settled(z) for term in self.terms)
 
-    def accept(self, x: PETSc.Vec) -> None:
-        """Make x the accepted state of every zone."""
+    def accept(self, x: PETSc.Vec) -> dict[str, ContactState]:
+        """Make x the accepted state of every zone, and report it.
+
+        Raises:
+            ArithmeticError: Surfaces of a zone, which may have been too far away to act, have lost each other; nothing
+                has been accepted.
+        """
         z = self.gather(x)
         with self._pairs():
+            states = {term.pair.name: term.state(z) for term in self.terms}
             for term in self.terms:
                 term.accept(z)
+        return states
 
     def hold(self, x: PETSc.Vec | None) -> None:
         """Stay with the die facets that are faced at x where a change of facet has a kink; None: let go."""

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from extrusion import cases
@@ -84,7 +85,6 @@ def test_toml_and_back(case: Case, tmp_path: Path) -> None:
         ("order", 2.0, "order"),
         ("order", True, "order"),
         ("theta", 0.5, "theta"),
-        ("theta", 1, "theta"),
         ("figures.0.point", "X", "figures.point"),
         ("figures.0.quantity", "u_z", "figures.quantity"),
         ("figures.0.t", 0, "figures.t"),
@@ -106,8 +106,8 @@ def test_toml_and_back(case: Case, tmp_path: Path) -> None:
         ("profile.die", [["A", 50, 0], ["B", 60, 70], ["C", 60, 0], ["D", 50, 70]], "profile.die"),  # crosses itself
         ("profile.die.1", ["B", float("nan"), 70], "profile.die B"),
         ("profile.radius", 0, "profile.radius"),
-        ("profile.radius", 70, "profile.radius"),  # the bore has 50
-        ("profile.length", 650, "profile.radius"),  # the die has 230
+        ("profile.radius", 70, "zones.1.die"),  # the bore has 50
+        ("profile.length", 650, "zones.2.die"),  # the die has 230
         ("profile.bore", ["A", "C"], "profile.bore"),
         ("name", "", "name"),
     ],
@@ -130,7 +130,7 @@ def test_a_ray_along_the_master_is_refused(billet: str, die: str, slave: str, al
     across = replace(zone, ray="y" if along == "r" else "r")
     case = replace(A, method="nitsche", zones=(zone,), figures=())
     if die == "bore":
-        with pytest.raises(InputError, match=f"zones.1.ray = '{across.ray}': .* take '{along}'"):
+        with pytest.raises(InputError, match=f"zones.1.ray = '{across.ray}': .*gap = 'closest'"):
             replace(case, zones=(across,))
         replace(case, method="nodal", zones=(across,))
     else:  # a cone is a graph over either
@@ -138,13 +138,37 @@ def test_a_ray_along_the_master_is_refused(billet: str, die: str, slave: str, al
 
 
 def test_overlap() -> None:
-    """The bore has r = 50 up to y = 70, then narrows by 1 in 3; the cone stands at y = 205 above r = 48."""
-    assert A.profile.overlap == 0
-    assert replace(A.profile, radius=52).overlap == pytest.approx(2)
-    assert replace(A.profile, length=76).overlap == pytest.approx(2)
-    assert replace(A.profile, length=209).overlap == pytest.approx(5)
-    assert replace(A.profile, radius=44, length=213).overlap == pytest.approx(213 - 206.25)
-    assert replace(A.profile, radius=20, length=213).overlap == 0
+    """The bore has r = 50 up to y = 70, then narrows by 1 in 3; the cone falls from y = 220 to 205 at r = 48."""
+
+    def depth(edge: str, die: str, **changes: float) -> float:
+        profile = replace(A.profile, **changes)
+        return profile.overlap(edge, getattr(profile, die))
+
+    assert depth("side", "bore") == 0
+    assert depth("side", "bore", radius=52) == pytest.approx(2)
+    assert depth("side", "bore", length=76) == pytest.approx(2)
+    assert depth("side", "bore", length=209) == pytest.approx(5)
+    assert depth("front", "cone", length=209) == pytest.approx(4)
+    assert depth("front", "cone", radius=44, length=213) == pytest.approx(213 - 206.25)
+    assert depth("front", "cone", radius=20, length=213) == 0
+    assert depth("side", "cone", length=212) == pytest.approx(50 - 48 * 8 / 15)
+    assert depth("front", "bore", length=300) == 0  # no graph over r
+
+
+def test_overlap_counts_where_there_is_contact() -> None:
+    """A zone's own surfaces, and not where contact is only checked."""
+    deep = replace(A.profile, radius=70)
+    with pytest.raises(InputError, match=r"zones.1.die = 'bore': the billet .* is 20 mm deep in it"):
+        replace(A, profile=deep, zones=A.zones[:1], figures=())
+    assert replace(A.with_contact("check"), profile=deep).profile.radius == 70
+    assert replace(A, profile=deep, zones=A.zones[1:], figures=()).profile.radius == 70
+
+
+def test_numpys_values_are_plain_ones() -> None:
+    """From an array of orders, say; and TOML has them."""
+    case = replace(A, order=np.int64(2), method=np.str_("nitsche"), zones=(replace(A.zones[0], smooth=np.True_),))
+    assert (type(case.order), type(case.method), type(case.zones[0].smooth)) == (int, str, bool)
+    assert "order = 2" in cases.to_toml(case)
 
 
 def test_increments() -> None:

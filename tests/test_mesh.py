@@ -356,3 +356,9 @@ def test_more_ranks_than_cells_is_refused() -> None:
     triangle = plain_mesh([[0, 0], [1, 0], [0, 1]], {"billet": [[0, 1, 2]]}, {})
     with pytest.raises(InputError, match=r"ranks = .* 1 cells only"):
         distribute(MPI.COMM_WORLD, triangle, ("billet",))
+
+
+def test_a_size_of_too_many_facets_is_refused() -> None:
+    """A thousandth of a thin billet's radius is too many along it."""
+    with pytest.raises(InputError, match=r"size = 0.01: give an element size between 0.013 and 1 mm"):
+        graded_mesh(replace(SSNV504, radius=1.0), 0.01)

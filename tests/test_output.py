@@ -214,6 +214,8 @@ def test_pictures(result: Result, folder: Path) -> None:
         ([0.0, 2e5, 8e5], "[kN]", None),
         ([0.0, -3e5, 7e5, 8e5, 3e7], "[MN], logarithmic from 1 on", ["0", "0.5", "1", "2", "5", "10", "20"]),
         ([0.0, 1e-20], "[N]", None),
+        ([0.0, 6.3], "[N]", None),
+        ([1e-25, 2e-24, 0.0, 1e-24, 3e-25, 1e-24, 0.0, 2e3], "[kN]", None),  # free until the last step
     ],
 )
 def test_axis_of_the_reaction(reaction: list[float], unit: str, labels: list[str] | None) -> None:
@@ -226,6 +228,8 @@ def test_axis_of_the_reaction(reaction: list[float], unit: str, labels: list[str
     if labels is None:
         assert axes.get_yscale() == "linear"
         assert len(shown) > 3
+        low, high = axes.get_ylim()
+        assert low <= 0 < max(force / (1e3 if "k" in unit else 1) for force in reaction) <= high
     else:
         assert [text for text in shown if not text.startswith("-")] == labels
 

@@ -22,7 +22,7 @@ from extrusion.errors import InputError, StepError
 from extrusion.mesh import PlainMesh, case_mesh
 from extrusion.newton import WATCH, Newton, Outcome
 from extrusion.problem import Problem
-from extrusion.stepping import Step, steps
+from extrusion.stepping import Step, _led, steps
 from extrusion.zones import ContactState, NodalContact
 
 LAWS: dict[str, dict[str, Any]] = {
@@ -396,6 +396,96 @@ def test_a_stiff_contact_is_led_to() -> None:
             K.append(run[-1].points["K"][1])
         apart[gamma] = abs(K[1] - K[0])
     assert apart[1e4] < 0.02 * apart[1e2]
+
+
+class Stiff(Newton):
+    """Converges, or not, as it is told; x remembers where it has been, by the stiffness."""
+
+    def __init__(self, problem: Condensed, answers: list[bool]) -> None:
+        super().__init__(problem)
+        self.answers, self.asked = answers, []
+
+    def solve(self, x: PETSc.Vec, at_most: int | None = None, ahead: float | None = 1.0, share: float = 0.0) -> Outcome:
+        term = self.problem.terms[0]
+        stiffness = self.problem.case.contact_gamma * float(term._k[0] / term._stiffness[0])
+        self.asked.append((round(stiffness, 1), round(float(x.array_r[1]), 1), ahead is None, share > 0))
+        good = self.answers.pop(0)
+        x.array[1] = stiffness if good else -1.0
+        return Outcome(good, 2, 0.0, "")
+
+
+@pytest.mark.parametrize(
+    ("gamma", "theta", "answers", "asked"),
+    [  # stiffness, what x comes with (1: predicted; else where it has been), whether x's own contact set, roughly
+        (30.0, 0, [True], [(30, 1, False, False)]),
+        (30.0, 0, [False], [(30, 1, False, False)]),
+        (40.0, 0, [True, True], [(10, 1, False, True), (40, 10, True, False)]),
+        (1e3, 0, [True] * 3, [(10, 1, False, True), (100, 10, True, True), (1e3, 100, True, False)]),
+        (1e3, 1, [True] * 2, [(100, 1, False, True), (1e3, 100, True, False)]),
+        (100.0, 1, [True], [(100, 1, False, False)]),
+        (  # half a decade from where it was
+            *(100.0, 0, [True, False, True, True]),
+            [(10, 1, False, True), (100, 10, True, False), (31.6, 10, True, True), (100, 31.6, True, False)],
+        ),
+        (  # nothing leads there: at once, from the prediction
+            *(40.0, 0, [True, False, False, False, True]),
+            [
+                *((10, 1, False, True), (40, 10, True, False)),
+                *((17.8, 10, True, True), (13.3, 10, True, True), (40, 1, False, False)),
+            ],
+        ),
+        (40.0, 0, [False, True], [(10, 1, False, True), (40, 1, False, False)]),
+    ],
+)
+def test_how_a_stiff_contact_is_led_to(
+    gamma: float, theta: int, answers: list[bool], asked: list[tuple[float, float, bool, bool]]
+) -> None:
+    """By decades; by shorter ones from where it was; at last at once. Never the same solve twice, nor left soft."""
+    case = replace(A, die="rigid", order=1, method="nitsche", theta=theta, gamma=gamma)
+    system = Condensed(Problem(case, case_mesh(A.profile), MPI.COMM_SELF))
+    newton = Stiff(system, [*answers])
+    system.x.array[1] = 1.0
+    outcome = _led(system, newton, 1.0)
+    assert newton.asked == asked
+    assert len(set(newton.asked)) == len(newton.asked)
+    assert (outcome.converged, outcome.iterations) == (answers[-1], 2 * len(answers))
+    assert np.all(system.terms[0]._k == system.terms[0]._stiffness)
+
+
+def test_a_solve_that_is_left_early_is_not_left_soft(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = replace(A, die="rigid", method="penalty", gamma=1e3)
+    system = Condensed(Problem(case, case_mesh(A.profile), MPI.COMM_SELF))
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    newton = Newton(system)
+    monkeypatch.setattr(newton, "solve", stop)
+    with pytest.raises(KeyboardInterrupt):
+        _led(system, newton, 1.0)
+    assert np.all(system.terms[0]._k == system.terms[0]._stiffness)
+
+
+def test_a_far_zone_that_has_lost_its_surface_cuts_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has no part in the residual, but in the report; nothing is accepted before all zones have reported."""
+    problem = Problem(A, case_mesh(A.profile), MPI.COMM_SELF)
+    near, far = problem.terms
+    report, accepted = far.state, []
+
+    def lost(z: np.ndarray) -> ContactState:
+        if z[problem._z_mine].max() > 15 and not accepted:
+            raise ArithmeticError("the deformed die is no graph over the ray's base line")
+        return report(z)
+
+    def accept(z: np.ndarray, done: Any = near.accept) -> None:
+        accepted.append(float(z.max()))
+        done(z)
+
+    monkeypatch.setattr(far, "state", lost)
+    monkeypatch.setattr(near, "accept", accept)
+    (step,) = steps(problem, Newton(problem), [20.0])
+    assert step.cuts == 1
+    assert accepted[0] < 15
 
 
 def test_an_increment_that_begins_with_no_number_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:

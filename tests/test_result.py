@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from extrusion import cases, run
+from extrusion.elasticity import Elastic
 from extrusion.errors import InputError
 from extrusion.mesh import PlainMesh, bundled, write_mesh
 from extrusion.problem import Problem
@@ -169,6 +170,8 @@ def test_ranks_do_not_matter() -> None:
     [
         ({"mehtod": "nodal"}, "mehtod = 'nodal': no such option; choose from name, title"),
         ({"goal": "foo"}, "goal = 'foo': choose one of K, reaction"),
+        ({"zones": ("x",)}, "zones = 'x': give each as"),
+        ({"order": 2, "form": "mixed", "billet": Elastic(5000, 0.0)}, "form = 'mixed': the pressure is divided by nu"),
         ({"until": 240.0, "increment": 60.0}, "increments = 240.0: end before the rear face leaves the die"),
     ],
 )
@@ -179,9 +182,27 @@ def test_bad_options(options: dict[str, Any], told: str) -> None:
     assert str(error.value).startswith(told)
 
 
-def test_a_name_is_no_case() -> None:
+@pytest.mark.parametrize("call", [run, verify])
+def test_a_name_is_no_case(call: Any) -> None:
     with pytest.raises(InputError, match="case = 'A': give a Case"):
-        run("A")  # type: ignore[arg-type]
+        call("A")
+
+
+def test_figures_of_an_increment_of_ones_own() -> None:
+    """They are looked for among the steps that are run; one of 0 is compared as it is."""
+    figures = tuple(replace(cases.A.figures[0], t=5.0, value=value, tolerance=1e-6) for value in (5.0, 0.0))
+    case = replace(cases.A, increments=((10.0, 10.0),), figures=figures)
+    with pytest.raises(InputError, match=r"figures.t = 5.0"):
+        verify(case)
+    (result,) = verify(case, increment=5.0)
+    exact, off = result.figures()
+    assert exact.ok
+    assert off.difference == pytest.approx(5.0)
+
+
+def test_forces_of_a_slab_are_told_by_its_thickness() -> None:
+    header = run(cases.A, space="plane strain", until=5).table().columns
+    assert "reaction\nkN/mm" in [column.header for column in header]
 
 
 def test_points_that_are_not_there(result: Result) -> None:
@@ -193,8 +214,11 @@ def test_points_that_are_not_there(result: Result) -> None:
 
 def test_what_another_method_or_space_leaves_behind() -> None:
     """theta is a variant of Nitsche's method alone; the sheet's figures are of the whole revolution."""
-    variant = replace(cases.A, method="nitsche", theta=-1)
-    assert changed(variant, method="mortar").theta == 0
-    assert changed(variant, order=2).theta == -1
-    assert changed(cases.A, space="plane strain").figures == ()
+    with pytest.raises(InputError, match="theta = -1: leave it out"):
+        changed(cases.A, theta=-1)
+    assert changed(cases.A, method="nitsche", theta=-1).theta == -1
+    slab = changed(cases.A, space="plane strain")
+    assert slab.figures == ()
+    own = replace(slab, figures=cases.A.figures[:1])
+    assert changed(own, space="plane strain").figures == own.figures
     assert changed(cases.A, space="3d").figures == cases.A.figures
