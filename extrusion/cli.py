@@ -419,6 +419,12 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
             _say("interrupted")
             sys.exit(INTERRUPTED)
         MPI = getattr(sys.modules.get("mpi4py.MPI"), "COMM_WORLD", None)
+        if isinstance(error, MemoryError) or "Out of memory" in str(error):
+            _say("out of memory: take a coarser mesh, order 1, or in 3D --solver iterative")
+            if MPI is None or MPI.size == 1:
+                sys.exit(1)
+            sys.stderr.flush()
+            MPI.Abort(1)
         if MPI is None or MPI.size == 1:
             raise
         traceback.print_exc()

@@ -23,7 +23,7 @@ import dolfinx.fem.petsc
 import ufl
 from dolfinx import fem
 
-from extrusion.cases import GAMMA, LOCKING_FROM, Case, Zone
+from extrusion.cases import GAMMA, LOCKING_FROM, MIXED_ABOVE, Case, Zone
 from extrusion.compiled import ray
 from extrusion.contact import CLOSED_GAP, REFERENCE_NU, stiffness
 from extrusion.elasticity import (
@@ -64,6 +64,26 @@ BILLET_POINTS = ("K", "L", "M", "N")
 """Named points of the profile that are the billet's corners; the others are the die's."""
 
 
+def _warn(case: Case) -> None:
+    """Say what of a case is known to do badly."""
+    nu, in_space, nodal = case.billet.nu, case.space == "3d", case.method == "nodal"
+    if case.order == 1 and nu >= LOCKING_FROM and not in_space and not nodal:
+        log.warning("order = 1 at nu = %g: linear triangles lock: pressure and reaction are far off, use order 2", nu)
+    if case.order == 1 and in_space and not nodal:
+        log.warning("order = 1 in 3D: facets are chords of the circle, and contact holds these: use order 2")
+    if case.element == "serendipity" and nodal and any(zone.contact == "unilateral" for zone in case.zones):
+        log.warning("20-node hexahedra under nodal pressure: its vertices pull, use nitsche or mortar")
+    if case.order == 2 and nu > MIXED_ABOVE and case.method == "nitsche" and not case.mixed:
+        log.warning("nitsche in the displacement form at nu = %g: the force is far off, take form = mixed", nu)
+    overlap = max(case.overlap(zone) for zone in case.zones)
+    if overlap > CLOSED_GAP * case.profile.radius:
+        log.warning("the billet stands up to %.3g mm deep in the die at t = 0: an interference fit", overlap)
+    leads = any(zone.slave == "billet" and zone.contact != "check" for zone in case.zones)
+    if case.die == "elastic" and case.die_material.E < case.billet.E and leads:
+        other = " and the method nitsche" if case.method == "mortar" else ""
+        log.warning('the die is softer than the billet: let it be slave (slave = "die")%s, or steps fail', other)
+
+
 class Problem(System):
     """One scene, discretised; x holds all displacements (and pressures and multipliers), each rank its own.
 
@@ -75,26 +95,8 @@ class Problem(System):
 
     def __init__(self, case: Case, mesh: PlainMesh | HexMesh | None, comm: MPI.Intracomm = MPI.COMM_WORLD) -> None:
         self.case, self.comm = case, comm
-        locks = case.order == 1 and case.billet.nu >= LOCKING_FROM and case.space != "3d"
-        if locks and case.method != "nodal" and comm.rank == 0:
-            log.warning(
-                "order = 1 at nu = %g: linear triangles lock: pressure and reaction are far off, use order 2",
-                case.billet.nu,
-            )
-        pressed = case.method == "nodal" and any(zone.contact == "unilateral" for zone in case.zones)
-        if case.element == "serendipity" and pressed and comm.rank == 0:
-            log.warning("20-node hexahedra under nodal pressure: its vertices pull, use nitsche or mortar")
-        if case.space == "3d" and case.order == 1 and case.method != "nodal" and comm.rank == 0:
-            log.warning("order = 1 in 3D: facets are chords of the circle, and contact holds these: use order 2")
-        overlap = max(case.overlap(zone) for zone in case.zones)
-        if overlap > CLOSED_GAP * case.profile.radius and comm.rank == 0:
-            log.warning("the billet stands up to %.3g mm deep in the die at t = 0: an interference fit", overlap)
-        billet_slave = any(zone.slave == "billet" and zone.contact != "check" for zone in case.zones)
-        if case.die == "elastic" and case.die_material.E < case.billet.E and billet_slave and comm.rank == 0:
-            other = "" if case.method != "mortar" else " and the method nitsche"
-            log.warning(
-                'the die is softer than the billet: let it be slave (slave = "die")%s, or steps may fail', other
-            )
+        if comm.rank == 0:
+            _warn(case)
         bodies = ("billet", "die") if case.die == "elastic" else ("billet",)
         self.tagged: TaggedMesh = _distributed(case, mesh, comm, bodies)
         self.bodies = bodies

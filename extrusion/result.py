@@ -380,7 +380,7 @@ def run(
         remedy = f"end before the rear face leaves the die, which ends at y = {top:g} mm"
         raise InputError("increments", case.end, remedy)
     if solver == "iterative" and (case.space != "3d" or case.mixed):
-        why = "the displacement form" if case.space == "3d" else "space = '3d'"
+        why = f"the displacement form (at nu = {case.billet.nu:g} mixed)" if case.space == "3d" else "space = '3d'"
         raise InputError("solver", solver, f"is for {why}: choose surface, full or auto")
     estimate = None
     if adapt and tolerance is None:
@@ -484,6 +484,9 @@ def _mesh(comm: MPI.Intracomm, case: Case, given: PlainMesh | HexMesh | None) ->
         mesh: PlainMesh | HexMesh
         if given is not None:
             mesh = given
+            if (mesh.points.shape[1] == 3) is not in_space:
+                remedy = "give a HexMesh, or another space" if in_space else "give a PlainMesh, or space = '3d'"
+                raise InputError("mesh", f"{mesh.points.shape[1]}-dimensional points", remedy)
         elif in_space:
             from extrusion.mesh3d import hex_mesh, read_hex
 

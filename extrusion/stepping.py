@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 from petsc4py import PETSc
 
@@ -79,7 +80,11 @@ class Step:
 
     @property
     def x(self) -> PETSc.Vec:
-        """All displacements, mm (`Problem.x`). Live, and collective: copy what must outlast the step."""
+        """All displacements, mm (`Problem.x`). Live, and collective: copy what must outlast the step.
+
+        Raises:
+            RuntimeError: The next step has been taken, or the run is over.
+        """
         return self.recover()
 
 
@@ -95,7 +100,7 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
     problem.place_billet(x)
     caught = _caught(problem, 0.0)
     points = problem.named_points()
-    t, rate, last = 0.0, x.duplicate(), 0.0
+    t, rate, last, live = 0.0, x.duplicate(), 0.0, _Live(problem)
     problem.shift_billet(rate, 1.0)  # du/dt that predicts the next increment: rigid at first, then that of the last one
     for target in times:
         cuts = iterations = passes = 0
@@ -150,9 +155,26 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
             gap=problem.point_gaps(x),
             caught=caught,
             zones=states,
-            recover=lambda: problem.recover(x),
+            recover=live.of_next(),
         )
         caught = dict.fromkeys(caught, 0.0)
+
+
+class _Live:
+    """The displacements of the step that has been taken last."""
+
+    def __init__(self, problem: System) -> None:
+        self._problem, self._number = problem, 0
+
+    def of_next(self) -> Callable[[], PETSc.Vec]:
+        """What gives those of the next step, as long as it is the last."""
+        self._number += 1
+        return partial(self._recover, self._number)
+
+    def _recover(self, number: int) -> PETSc.Vec:
+        if number != self._number:
+            raise RuntimeError("the field of a step is gone once the next one is taken: copy what must outlast it")
+        return self._problem.recover(self._problem.x)
 
 
 def _remedy(case: Case) -> str:

@@ -239,6 +239,17 @@ def test_interrupted_before_the_first_step(monkeypatch: pytest.MonkeyPatch, caps
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def test_out_of_memory(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    """PETSc's own words are a page."""
+
+    def fail(self: Newton, *_: object) -> None:
+        raise RuntimeError("Failed to call PETSc function 'X'. PETSc error code is: 55, Out of memory")
+
+    monkeypatch.setattr(Newton, "__init__", fail)
+    assert command("run", "A", "--until", "5", "--quiet") == 1
+    assert capsys.readouterr().err.startswith("extrusion: out of memory: take a coarser mesh")
+
+
 def test_in_a_thread() -> None:
     """Where no signal can be caught."""
     codes: list[int] = []

@@ -86,6 +86,17 @@ def test_nearly_incompressible_takes_the_mixed_form_and_keeps_its_volume() -> No
     assert pytest.approx(65 * 2 * 0.4999 * 2 / (0.5001 * 50), abs=1e-4) == K - 135.2
 
 
+def test_nitsche_without_a_pressure_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    """At nu = 0.4999 the force of the displacement form is 69 % off in 3D; the mixed form is taken unless told."""
+    case = replace(problems()["unilateral"], order=2, size=8.0, die="rigid", billet=Elastic(5000, 0.4999), theta=-1)
+    mesh = case_mesh(case.profile, 8.0)
+    Problem(case, mesh, MPI.COMM_SELF)
+    Problem(replace(case, form="displacement", method="mortar", theta=0), mesh, MPI.COMM_SELF)
+    assert "displacement form" not in caplog.text
+    Problem(replace(case, form="displacement"), mesh, MPI.COMM_SELF)
+    assert "nitsche in the displacement form at nu = 0.4999" in caplog.text
+
+
 @pytest.mark.parametrize(("order", "theta", "gamma"), [(2, 1, 10.0), (1, 1, 3.0), (1, 0, 0.1), (2, 0, 0.1)])
 def test_a_gamma_too_small_is_refused(order: int, theta: int, gamma: float) -> None:
     """Linear elements, theta = 0, gamma = 0.1 once converged to a K wrong by 222 mm without a sign."""

@@ -331,6 +331,19 @@ def test_a_second_run_of_a_problem_is_the_first(law: str) -> None:
     assert_allclose(K[0], K[1], rtol=1e-12)
 
 
+@pytest.mark.parametrize("solver", [Problem, lambda *of: Condensed(Problem(*of))])
+def test_a_kept_step_has_no_field_of_another(solver: Any) -> None:
+    """It was that of the last step, without a word."""
+    system = solver(A, case_mesh(A.profile), MPI.COMM_SELF)
+    run = steps(system, Newton(system), [5.0, 10.0])
+    first = next(run)
+    assert first.x.norm() > 0
+    second = next(run)
+    assert second.x.norm() > 0
+    with pytest.raises(RuntimeError, match="gone once the next one is taken"):
+        _ = first.x
+
+
 def test_a_solver_that_is_done_with_is_freed() -> None:
     """Else MPI ends the process at the 300th run of a study: it has 2048 communicators."""
     problem = Problem(A, case_mesh(A.profile), MPI.COMM_SELF)

@@ -17,6 +17,7 @@ from extrusion import cases, run
 from extrusion.elasticity import Elastic
 from extrusion.errors import InputError
 from extrusion.mesh import PlainMesh, bundled, write_mesh
+from extrusion.mesh3d import hex_mesh
 from extrusion.problem import Problem
 from extrusion.result import Result, changed, verify
 from extrusion.stepping import Step
@@ -170,6 +171,8 @@ def test_ranks_do_not_matter() -> None:
     [
         ({"mehtod": "nodal"}, "mehtod = 'nodal': no such option; choose from name, title"),
         ({"goal": "foo"}, "goal = 'foo': choose one of K, reaction"),
+        ({"mesh": hex_mesh(cases.A.profile, 16.0, 4)}, "mesh = '3-dimensional points': give a PlainMesh"),
+        ({"mesh": bundled(cases.A.profile), "space": "3d"}, "mesh = '2-dimensional points': give a HexMesh"),
         ({"zones": ("x",)}, "zones = 'x': give each as"),
         ({"order": 2, "form": "mixed", "billet": Elastic(5000, 0.0)}, "form = 'mixed': the pressure is divided by nu"),
         ({"until": 240.0, "increment": 60.0}, "increments = 240.0: end before the rear face leaves the die"),
