@@ -134,6 +134,7 @@ def billet(record: Record) -> Figure:
     """The deformed billet in the die, mirrored about the axis, coloured by von Mises stress (cell means)."""
     from matplotlib.collections import PolyCollection
     from matplotlib.colors import Normalize
+    from matplotlib.ticker import MaxNLocator
 
     snapshots = record.snapshots
     if snapshots is None:
@@ -170,6 +171,7 @@ def billet(record: Record) -> Figure:
         ax.set(xlim=(-rim, rim), ylim=(bottom, top), aspect="equal", xlabel="r [mm]")
         ax.set_title(f"t = {snapshots.t[i]:g} mm", fontsize="medium")
         ax.tick_params(direction="out", top=False, right=False)
+        ax.xaxis.set_major_locator(MaxNLocator(4, prune="both"))  # the next panel's begin where these end
     axes[0].set_ylabel("y [mm]")
     peak = f"von Mises stress [MPa], peak {stress.max():.4g}"
     figure.colorbar(cells, cax=bar, label=peak, extend="max")

@@ -188,6 +188,10 @@ class Result:
             table.add_row(*row)
         return table
 
+    def __repr__(self) -> str:
+        end = f"{len(self.steps)} steps to t = {self.steps[-1].t:g} mm" if self.steps else "no step"
+        return f"<Result of {self._title()}: {end}, {'converged' if self.converged else self.error}>"
+
     def _repr_html_(self) -> str:
         header, rows = self._rows(range(len(self.steps)))
         head = "".join(f"<th>{html.escape(name)}</th>" for name in header)

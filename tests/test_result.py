@@ -52,6 +52,14 @@ def test_arrays(result: Result) -> None:
         _ = result.steps[0].x
 
 
+def test_one_line(result: Result) -> None:
+    """What a prompt shows."""
+    told = "<Result of A: nodal, P1, elastic die, 686 dofs, 1 rank: 3 steps to t = 30 mm, converged>"
+    assert repr(result) == told
+    failed = replace(result, steps=[], converged=False, error="out of reach")
+    assert repr(failed).endswith("no step, out of reach>")
+
+
 def test_json(result: Result) -> None:
     """The object of ``--json``: these keys in this order, values unrounded, all of it strict JSON."""
     text = json.dumps(result.to_dict(), allow_nan=False)
