@@ -12,12 +12,14 @@ import importlib.util
 import json
 import logging
 import os
+import re
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, cast
 
@@ -409,7 +411,7 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
         _say(str(error))
         sys.exit(2)
     except typer.TyperException as error:
-        _say(error.format_message())
+        _say(_with_value(error.format_message(), sys.argv[1:] if args is None else args))
         sys.exit(2)
     except typer.Abort:
         _say("interrupted")
@@ -479,6 +481,17 @@ def _say(message: str) -> None:
     """One line on stderr, from rank 0."""
     if message and _rank() == 0:
         print("extrusion:", " ".join(message.split()), file=sys.stderr)
+
+
+def _with_value(message: str, args: Sequence[str]) -> str:
+    """Typer's words for an option that is no number, with the value that it leaves out."""
+    found = re.match(r"Invalid value for '(--\w+)': Input should be a valid (integer|number)", message)
+    if found is None:
+        return message
+    name, kind = found.groups()
+    values = [value for option, value in pairwise(args) if option == name]
+    values += [arg.removeprefix(f"{name}=") for arg in args if arg.startswith(f"{name}=")]
+    return f"{name} = {values[-1]!r}: give {'an integer' if kind == 'integer' else 'a number'}" if values else message
 
 
 def _by_interrupt(error: BaseException | None) -> bool:
