@@ -148,7 +148,7 @@ class Newton:
             return int(reason.DIVERGED_FNORM_NAN)
         if norm <= self.tolerance:
             return int(reason.CONVERGED_FNORM_ABS)
-        if it and norm <= self._share * self.history[0]:
+        if norm <= self._share * self.history[0]:
             return int(reason.CONVERGED_FNORM_RELATIVE)
         if it >= self._limit or (self._limit < self._max and norm < ROUGHLY * self.history[0]):
             return int(reason.DIVERGED_MAX_IT)

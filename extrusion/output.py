@@ -71,10 +71,8 @@ class Folder:
 
         def make() -> None:
             self.path.mkdir(parents=True, exist_ok=True)
-            for name in ("history.csv", "contact.csv"):
-                (self.path / name).open("a", encoding="utf-8").close()  # refused before anything is removed
-            (self.path / "contact.csv").unlink()
-            for name in ("run.json", "snapshots.npz", *(f"{kind}.png" for kind in plots.KINDS)):
+            (self.path / "history.csv").open("a", encoding="utf-8").close()  # refused before anything is removed
+            for name in ("contact.csv", "run.json", "snapshots.npz", *(f"{kind}.png" for kind in plots.KINDS)):
                 (self.path / name).unlink(missing_ok=True)  # an earlier run's
 
         write_on_root(comm, self.path, make)

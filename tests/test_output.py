@@ -244,10 +244,11 @@ def test_a_billet_turned_inside_out_is_warned_of(caplog: pytest.LogCaptureFixtur
     assert "inside out" not in caplog.text
 
 
-def test_a_file_that_cannot_be_written_leaves_the_others(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["history.csv", "contact.csv"])
+def test_a_file_that_cannot_be_written_leaves_the_others(name: str, tmp_path: Path) -> None:
     """What an earlier run left is removed only when all can be written anew."""
     (tmp_path / "run.json").write_text("an earlier run")
-    (tmp_path / "contact.csv").mkdir()
+    (tmp_path / name).mkdir()
     with pytest.raises(InputError, match="cannot be written"):
         run(cases.A, until=5, out=tmp_path)
     assert (tmp_path / "run.json").read_text() == "an earlier run"
