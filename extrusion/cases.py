@@ -186,7 +186,7 @@ class Case:
                     raise InputError(f"zones.{zone.name}.{name}", value, f"method = 'mortar' knows {needed!r} only")
             if zone.die == "cone" and not self.profile.cone:
                 raise InputError(f"zones.{zone.name}.die", "cone", "the profile names no cone")
-            self._check_ray(zone)
+            self._check_zone(zone)
         if not self.increments:
             raise InputError("increments", [], "give at least one pair (increment, up to t)")
         t = count = 0.0
@@ -208,7 +208,7 @@ class Case:
                 known = ", ".join(points)
                 raise InputError("figures.point", figure.point, f"name one of {known}")
 
-    def _check_ray(self, zone: Zone) -> None:
+    def _check_zone(self, zone: Zone) -> None:
         """Refuse a master that is no graph along the zone's ray, and a billet deep in the die."""
         profile = self.profile
         if self.along_ray(zone):

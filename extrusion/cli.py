@@ -166,7 +166,7 @@ def run(
         to_stdout = json_file == Path("-")
         if json_file and not to_stdout:
             _check_writable("json", json_file)
-        _warn_of_ranks()
+        _start()
         with _progress(scene, quiet) as observers, _Interrupt() as interrupt:
             result = solve(
                 scene,
@@ -222,7 +222,7 @@ def verify(
         "",
     ):
         table.add_column(name, justify="left" if name in ("case", "contact", "figure", "") else "right")
-    _warn_of_ranks()
+    _start()
     errors, ok = [], True
     for case in [_load(name) for name in cases] if cases else CASES.values():
         with _progress(case, quiet) as observers:
@@ -560,8 +560,8 @@ def _write_json(result: Result, path: Path | None) -> None:
         raise InputError("json", str(path or "-"), f"cannot be written ({error.strerror})") from None
 
 
-def _warn_of_ranks() -> None:
-    """Say so if there are more ranks on this machine than cores: MPICH busy-waits."""
+def _start() -> None:
+    """Load MPI and PETSc, and say so if there are more ranks on this machine than cores: MPICH busy-waits."""
     from extrusion.check import require_dolfinx
 
     require_dolfinx()

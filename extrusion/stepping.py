@@ -269,16 +269,17 @@ def _led(problem: System, newton: Newton, ahead: float) -> Outcome:
     Where that leads nowhere the increment is solved at once.
     """
     x, case = problem.x, problem.case
+    gamma, at, ratio, iterations = case.contact_gamma, 0.0, STIFFEN, 0
     soft = SOFT * STIFFEN if case.theta == 1 else SOFT  # which is not coercive below 27 to 36
-    gamma = case.contact_gamma if case.method in ("penalty", "nitsche") else soft
-    predicted, reached = x.duplicate(), x.duplicate()
-    x.copy(predicted)
-    at, ratio, iterations = 0.0, STIFFEN, 0
 
     def following(at: float) -> float:
         goal = max(soft, ratio * at)
         return gamma if goal > gamma / np.sqrt(ratio) else goal  # no further solve for a ratio as small as that
 
+    if case.method not in ("penalty", "nitsche") or following(at) == gamma:
+        return newton.solve(x, ahead=ahead)
+    predicted, reached = x.duplicate(), x.duplicate()
+    x.copy(predicted)
     try:
         while True:
             goal = following(at)
@@ -293,15 +294,13 @@ def _led(problem: System, newton: Newton, ahead: float) -> Outcome:
                 continue
             while at and ratio > LEAST and following(at) >= goal:
                 ratio **= 0.5
-            if at and following(at) < goal:
-                reached.copy(x)
-                continue
-            if goal < gamma or at:  # at once
+            if not at or following(at) >= goal:  # at once
                 predicted.copy(x)
                 problem.soften(1.0)
                 outcome = newton.solve(x, ahead=ahead)
                 iterations += outcome.iterations
-            break
+                break
+            reached.copy(x)
     finally:
         problem.soften(1.0)
     return replace(outcome, iterations=iterations)
