@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from mpi4py import MPI  # noqa: F401  the wheel's PETSc needs the MPI that it loads
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -145,7 +145,7 @@ class Condensed(System):
     def __init__(self, problem: Problem, stiff_die: bool = False) -> None:
         self.full, self._stiff_die = problem, stiff_die
         self.case, self.comm, self.terms = problem.case, problem.comm, problem.terms
-        self.n_z, self.n_multipliers = problem.n_z, problem.n_multipliers
+        self.n_z, self.n_multipliers, self.evaluating = problem.n_z, problem.n_multipliers, MPI.COMM_SELF
         self.on_root = self.comm.rank == 0
         on_root(self.comm, blocks)  # compiled there, if it has to be
         self._number()

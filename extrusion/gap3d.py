@@ -138,6 +138,14 @@ class Facets:
         out[row, column] = np.arange(len(self.X))
         return out if (out >= 0).all() else None
 
+    def take(self, on: Index) -> Facets:
+        """Some of the facets."""
+        pressure_cols = None if self.pressure_cols is None else self.pressure_cols[on]
+        return Facets(
+            self.X[on], self.nodes[on], self.cell_nodes[on], self.local[on], self.frame[on], self.cell_X[on],
+            self.side[on], self.tabulate, self.tabulate_geometry, pressure_cols,
+        )  # fmt: skip
+
     def position(self, z: Array) -> Array:
         """Current positions of the facets' nodes, ``shape=(m, k, 3)``, mm."""
         return np.asarray(self.X + z[3 * self.nodes[..., None] + np.arange(3)])

@@ -118,6 +118,10 @@ class Pair(ABC):
         ``keep``: die facets to stay with, from `facing`, where points are not split at the facets' edges.
         """
 
+    def share(self, facets: Index) -> Pair | None:
+        """The same pair with the `points` of these slave facets alone; None where that would not pay."""
+        return None
+
     def touches(self, z: Array, points: Points, radius: float, interpenetrating: bool) -> np.ndarray:
         """Which of points at the start a bilateral zone holds from then on."""
         return closed_at_start(points.gap, radius, interpenetrating)

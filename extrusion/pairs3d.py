@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,6 +36,7 @@ class SurfacePair(Pair):
 
     slave: Facets
     die: Facets | Revolved
+    shared: Index | None = None  # the slave facets of which `points` gives those of
 
     dim = 3
     copies = COPIES
@@ -94,11 +95,13 @@ class SurfacePair(Pair):
     def points(
         self, z: Array, order: int, variation: bool, material: Elastic | None = None, keep: Index | None = None
     ) -> tuple[Points, Array | None, Array | None]:
-        slave = self.slave
+        slave, some = self.slave, self._some
         if self.ray and self.axis == 0:
-            points = line_points(slave, self.die, z, self.sign, order, variation)
+            points = line_points(some, self.die, z, self.sign, order, variation)
         else:
-            points = scattered_points(slave, self.die, z, self.axis, self.sign, order, self.ray, self.smooth, keep)
+            points = scattered_points(some, self.die, z, self.axis, self.sign, order, self.ray, self.smooth, keep)
+        if self.shared is not None:
+            points = replace(points, facet=self.shared[points.facet])
         if material is None:
             return points, None, None
         n_u, n_points = 3 * slave.cell_nodes.shape[1], points.G.shape[2]
@@ -125,6 +128,13 @@ class SurfacePair(Pair):
         if slave.pressure_cols is not None:
             points = widened(points, slave.pressure_cols[points.facet])
         return points, S, S_xi
+
+    def share(self, facets: Index) -> SurfacePair:
+        return replace(self, shared=facets)
+
+    @cached_property
+    def _some(self) -> Facets:
+        return self.slave if self.shared is None else self.slave.take(self.shared)
 
     def touches(self, z: Array, points: Points, radius: float, interpenetrating: bool) -> np.ndarray:
         # between its nodes a facet that touches is off the circle by a little: what counts are the nodes

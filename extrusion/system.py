@@ -33,6 +33,8 @@ class System(ABC):
     x: PETSc.Vec
     n_z: int
     n_multipliers: int
+    evaluating: MPI.Intracomm  # ranks that evaluate the terms together
+    shared = False  # whether they do: each a part of the slave facets
     pairing = 0.0  # s, spent so far in finding contact points and evaluating the terms
 
     # -- unknowns --------------------------------------------------------------------------------------------
@@ -108,10 +110,12 @@ class System(ABC):
         with self._pairs():
             for term in self.terms:
                 term.add_residual(z, R)
+            if self.shared:
+                self.evaluating.Allreduce(MPI.IN_PLACE, R)
         return R
 
     def contact_tangent(self, z: Array, geometric: bool, rows: np.ndarray, cols: np.ndarray) -> Triplets:
-        """Its derivative as (rows, columns, values).
+        """Its derivative as (rows, columns, values); this rank's part of it where terms are shared.
 
         Args:
             z: Where.
@@ -140,6 +144,10 @@ class System(ABC):
     def start(self, x: PETSc.Vec) -> None:
         """Accepted contact state at t = 0."""
         z = self.gather(x)
+        self.shared = all([term.share(self.evaluating) for term in self.terms])
+        if not self.shared:
+            for term in self.terms:
+                term.share(MPI.COMM_SELF)
         for term in self.terms:
             term.start(z)
 

@@ -11,6 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from mpi4py import MPI
+
 import numpy as np
 import scipy.sparse
 
@@ -29,6 +31,12 @@ class ContactTerm(Protocol):
     multipliers: int
     forced: Index  # displacements (and pressures) in z that the term can put a force on, in order along slave and die
     caught: float  # mm: how far from the die the farthest point was that the last `start` or `accept` closed for good
+
+    def share(self, comm: MPI.Intracomm) -> bool:
+        """From now on add to residual and tangent what this rank's part of the slave's facets does, and say if so.
+
+        All methods are collective then. On one rank, or where it would not pay: what all facets do.
+        """
 
     def start(self, z: Array) -> None:
         """Set the accepted state at t = 0 from the gap there."""
@@ -254,6 +262,9 @@ class NodalContact:
         self._last: np.ndarray | None = None  # nodes that the last pairing's solve left closed
         self._expects = False
 
+    def share(self, comm: MPI.Intracomm) -> bool:
+        return False
+
     def start(self, z: Array) -> None:
         self.pair_up(z)
         gap = self._g0 + self._apply(z)
@@ -412,8 +423,24 @@ class IntegratedContact:
         self.closed, self.caught = np.zeros(len(pair.slave.nodes), dtype=bool), 0.0
         self._expected = Expected()
         self._is_far = _Latest(lambda z: pair.is_far(z, radius))
-        self._points = _Latest(self._find)
         self._held: Index | None = None
+        self.share(MPI.COMM_SELF)
+
+    def share(self, comm: MPI.Intracomm) -> bool:
+        mine = None
+        if 1 < comm.size <= len(self.closed):  # no part is empty
+            mine = self.pair.share(np.arange(comm.rank, len(self.closed), comm.size))  # what is closed is in one place
+        self._comm, self._mine = (MPI.COMM_SELF, self.pair) if mine is None else (comm, mine)
+        self._points = _Latest(self._find)
+        return mine is not None
+
+    def _of_all(self, facet: Index, *rows: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Rows that belong to facets, of all ranks and in the facets' order."""
+        if self._comm.size == 1:
+            return rows
+        facet, *rows_ = (np.concatenate(part) for part in zip(*self._comm.allgather((facet, *rows)), strict=True))
+        order = np.argsort(facet, kind="stable")
+        return tuple(row[order] for row in rows_)
 
     def hold(self, z: Array | None) -> None:
         self._held = None if z is None or self._is_far(z) else self.pair.facing(self._points(z)[0])
@@ -426,7 +453,7 @@ class IntegratedContact:
         points = self._points(z)[0]
         held = self.pair.touches(z, points, self._radius, self._interpenetrating)
         self.closed = self._whole_facets(points, held)
-        self.caught = _farthest(points.gap, self.closed[points.facet])
+        self._catch(points, self.closed)
 
     def pair_up(self, z: Array, settle: bool = False, before: Array | None = None) -> None:
         pass
@@ -443,7 +470,12 @@ class IntegratedContact:
         closed = trial < 0.0
         if not self.pair.extended:
             closed &= ~points.past
-        return ContactSet.of(self.pair.along(z, points), trial, closed)
+        return ContactSet.of(*self._of_all(points.facet, self.pair.along(z, points), trial, closed))
+
+    def _catch(self, points: Points, new: np.ndarray) -> None:
+        self.caught = _farthest(points.gap, new[points.facet])
+        if self._comm.size > 1:
+            self.caught = self._comm.allreduce(self.caught, op=MPI.MAX)
 
     def stiffness_norm(self) -> float:
         if self.pair.closure == "check":
@@ -455,13 +487,23 @@ class IntegratedContact:
         return float(np.linalg.norm(k * weight))
 
     def _whole_facets(self, points: Points, held: np.ndarray) -> np.ndarray:
+        """Facets of which all points are held; it says nothing of other ranks' facets."""
         every = np.ones(len(self.closed), dtype=bool)
         np.logical_and.at(every, points.facet, held.all(axis=1))
         return every
 
     def _find(self, z: Array) -> tuple[Points, Array | None, Array | None]:
         """Contact points with the rows of the slave's own stress and their derivative, over the points' columns."""
-        return self.pair.points(z, self._order, self.pair.closure != "check", self._material, self._held)
+        lost = ""
+        try:
+            found = self._mine.points(z, self._order, self.pair.closure != "check", self._material, self._held)
+        except (ArithmeticError, np.linalg.LinAlgError) as error:
+            lost = str(error)
+        if self._comm.size > 1:
+            lost = max(self._comm.allgather(lost))
+        if lost:
+            raise ArithmeticError(lost)
+        return found
 
     def _trial(self, z: Array, points: Points, S: Array | None) -> tuple[Array, Array, Array]:
         """The slave's own stress, the trial stress, and k."""
@@ -567,13 +609,14 @@ class IntegratedContact:
             _, _, dsc, _ = self._law(z, points, S)
             before = self.closed
             self.closed = before | self._whole_facets(points, dsc > 0)
-            self.caught = _farthest(points.gap, (self.closed & ~before)[points.facet])
+            self._catch(points, self.closed & ~before)
 
     def state(self, z: Array) -> ContactState:
         points, S, _ = self._points(z)
         _, sc, dsc, _ = self._law(z, points, S)
         closed = points.gap < 0 if self.pair.closure == "check" else dsc > 0
-        return self.pair.report(z, points, sc, closed)
+        mine = self.pair.report(z, points, sc, closed)
+        return ContactState(*self._of_all(np.repeat(points.facet, points.gap.shape[1]), *vars(mine).values()))
 
 
 class MortarContact:
@@ -616,6 +659,9 @@ class MortarContact:
         self._is_far = _Latest(lambda z: pair.is_far(z, radius))
         self._points = _Latest(self._find)
         self._held: Index | None = None
+
+    def share(self, comm: MPI.Intracomm) -> bool:
+        return False
 
     def hold(self, z: Array | None) -> None:
         self._held = None if z is None or self._is_far(z) else self.pair.facing(self._points(z))

@@ -76,6 +76,17 @@ def test_two_ranks_are_one(name: str) -> None:
     np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=0, atol=1e-9)
 
 
+@pytest.mark.mpi
+def test_all_unknowns_on_two_ranks() -> None:
+    """Each rank finds all points of a curve: none is reported twice."""
+    found = []
+    for system in (scene(UNILATERAL, MPI.COMM_WORLD), Condensed(scene(UNILATERAL))):
+        *_, step = steps(system, Newton(system), [5.0, 20.0])
+        found.append(step.zones["1"])
+    np.testing.assert_allclose(found[0].pressure, found[1].pressure, rtol=0, atol=1e-6)
+    assert found[1].closed.any()
+
+
 def test_only_what_is_reached_is_solved_for() -> None:
     """A right-hand side for every die point: up to t = 20 the exit and the cone are never touched."""
     system = Condensed(scene(replace(UNILATERAL, size=2.0)))

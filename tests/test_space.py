@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from mpi4py import MPI
@@ -263,6 +264,84 @@ def test_billet_between_E_and_F(law: str, element: str) -> None:
         spread = {("nodal", "hex20"): 8, ("nodal", "hex27"): 4}.get((law, element), 1) * (4 / sectors) ** 2
         assert_allclose(state.pressure, 363.636363, rtol=0.01 * spread)
         assert step.reaction == pytest.approx(0, abs=1e-4)
+
+
+# -- ranks -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("solver", ["full", "iterative"])
+@pytest.mark.parametrize(
+    ("law", "element", "die", "slave"),
+    [
+        ("penalty", "hex8", "rigid", "billet"),
+        ("nitsche 0", "hex20", "elastic", "billet"),
+        ("nitsche -1", "hex8", "elastic", "die"),
+    ],
+)
+def test_shared_facets(law: str, element: str, die: str, slave: str, solver: str) -> None:
+    """Ranks with a part of the slave's facets each do together what one does with all of them."""
+    comm, zones = MPI.COMM_WORLD, (GLIDING, FRONT) if slave == "billet" else (replace(SIDE, slave=slave),)
+    of = {"comm": comm, "die": die, "zones": zones, **LAWS[law], **ELEMENTS[element]}
+    together, alone = (in_space(**of) for _ in range(2))
+    alone.evaluating = MPI.COMM_SELF
+    taken, cycles = [], []
+    for problem in (together, alone):
+        if solver == "iterative":
+            problem.iterate()
+        newton = Newton(problem)
+        *_, step = steps(problem, newton, [20.0, 26.0])
+        taken.append(step)
+        cycles.append(newton.snes.getLinearSolveIterations())
+    assert (together.shared, alone.shared) == (comm.size > 1, False)
+    assert taken[0].iterations == taken[1].iterations
+    assert cycles[0] == cycles[1]
+    assert taken[0].caught == pytest.approx(taken[1].caught, abs=1e-9)
+    for name, state in taken[0].zones.items():
+        for field_, values in vars(state).items():
+            assert_allclose(values, vars(taken[1].zones[name])[field_], rtol=1e-6, atol=1e-6)
+
+    x, y = together.x, together.x.duplicate()
+    rng = np.random.default_rng(comm.rank)
+    x.array[:] += 1e-2 * rng.standard_normal(len(x.array))
+    y.array[:] = rng.standard_normal(len(y.array))
+    y.array[together.held_rows] = 0.0
+    z = together.gather(x)
+    forces = [problem.contact_forces(z) for problem in (together, alone)]
+    assert np.any(forces[1])
+    assert_allclose(*forces, rtol=0, atol=1e-12 * np.abs(forces[1]).max())
+    images = []
+    for problem in (together, alone):
+        image = y.duplicate()
+        problem.tangent(x, True).mult(y, image)
+        images.append(image)
+    images[0].axpy(-1.0, images[1])
+    assert images[0].norm() < 1e-12 * images[1].norm()
+    if comm.size > 1:
+        parts = [term.tangent(z, True)[2].size for term in together.terms if term.pair.name == "1"]
+        whole = [term.tangent(z, True)[2].size for term in alone.terms if term.pair.name == "1"]
+        assert 0.3 * whole[0] < parts[0] < 0.7 * whole[0]
+
+    sides = [problem.terms[0] for problem in (together, alone)]
+    assert all(isinstance(side, IntegratedContact) for side in sides)
+    sets = [side._found(z) for side in sides]
+    assert len(sets[1].edges) > 2
+    assert_allclose(sets[0].edges, sets[1].edges, rtol=0, atol=1e-9)
+    nodes, X = sides[0].pair.nodes, sides[0].pair.X
+    for component in (0, 2):  # into the die
+        z[3 * nodes + component] += 0.05 * X[:, component] * (1 if slave == "billet" else -1)
+    for side in sides:
+        side.closed = np.zeros_like(side.closed)
+        side.accept(z)
+    assert sides[0].caught == pytest.approx(sides[1].caught)
+    assert law != "penalty" or sides[0].caught > 1e-3
+
+    assert not sides[1].share(SimpleNamespace(rank=0, size=10**6))  # some ranks would have none
+
+    corner = sides[0].pair.slave.vertices[0, 0]  # of one facet alone
+    z[3 * corner] = np.nan
+    with pytest.raises(ArithmeticError):  # on every rank
+        together.contact_forces(z)
 
 
 # -- balances, and other ways to the same answer ---------------------------------------------------------------
