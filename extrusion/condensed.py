@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from mpi4py import MPI
+from mpi4py import MPI  # noqa: F401  the wheel's PETSc needs the MPI that it loads
 from petsc4py import PETSc
 
 import numpy as np
@@ -145,7 +145,7 @@ class Condensed(System):
     def __init__(self, problem: Problem, stiff_die: bool = False) -> None:
         self.full, self._stiff_die = problem, stiff_die
         self.case, self.comm, self.terms = problem.case, problem.comm, problem.terms
-        self.n_z, self.n_multipliers, self.evaluating = problem.n_z, problem.n_multipliers, MPI.COMM_SELF
+        self.n_z, self.n_multipliers = problem.n_z, problem.n_multipliers
         self.on_root = self.comm.rank == 0
         on_root(self.comm, blocks)  # compiled there, if it has to be
         self._number()
@@ -303,9 +303,8 @@ class Condensed(System):
         moved[self._z_of[np.searchsorted(self._in_z, die)]] += u[at]
         f, y = x.duplicate(), x.duplicate()
         out = f.array
-        if self.on_root:
-            out[0] = 0.0
-            out[1:] = self._out_of_balance(x, moved)
+        out[:1] = 0.0
+        out[1:] = self._out_of_balance(x, moved)
         ksp = PETSc.KSP().create(self.comm)
         self.set_solver(ksp)
         self._tangent.forget()
@@ -389,26 +388,33 @@ class Condensed(System):
 
     def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         out = f.array  # on every rank: PETSc counts changes, and forgets the norm
-        if not self.on_root:
-            return
         try:
-            out[1:] = self._out_of_balance(x, self._z(x))
-            out[0] = 0.0
+            out[1:] = self._out_of_balance(x, self._evaluated(x))
+            out[:1] = 0.0
         except ArithmeticError:
             out[:] = np.nan
 
+    def _evaluated(self, x: PETSc.Vec) -> Array:
+        """The contact vector, where terms are evaluated: on rank 0, or if they are shared on all."""
+        return self.gather(x) if self.shared else self._z(x) if self.on_root else np.zeros(0)
+
     def _out_of_balance(self, x: PETSc.Vec, z: Array) -> Array:
-        """The residual's rows of forces and multipliers; on rank 0."""
-        R = self.contact_forces(z)
+        """The residual's rows of forces and multipliers, on rank 0; z is given where it is `_evaluated`."""
+        R = self.contact_forces(z) if self.on_root or self.shared else np.zeros(0)
+        if not self.on_root:
+            return np.zeros(0)
         out = np.concatenate([R[self.z_forced], R[self.n_z - self.n_multipliers :]])
         out[: self.n_forces] -= x.array_r[1 : 1 + self.n_forces]
         return out
 
     def tangent(self, x: PETSc.Vec, geometric: bool) -> PETSc.Mat:
         D, f = None, np.zeros(0)
+        z = self._evaluated(x)
+        if self.on_root or self.shared:
+            wanted = (self._force_of_z >= 0) & self.on_root
+            rows, cols, values = self.contact_tangent(z, geometric, wanted, self._row_of_z >= 0)
         if self.on_root:
-            z, f = self._z(x), self._split(x)[1]
-            rows, cols, values = self.contact_tangent(z, geometric, self._force_of_z >= 0, self._row_of_z >= 0)
+            f = self._split(x)[1]
             some = values != 0.0
             D = _Derivative(self._force_of_z[rows[some]], self._row_of_z[cols[some]], values[some])
         self._tangent.set(D, f)

@@ -17,7 +17,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
-import scipy.sparse
 
 import basix.ufl
 import dolfinx.fem.petsc
@@ -44,8 +43,8 @@ from extrusion.mesh import PlainMesh, TaggedMesh, check_profile, distribute, on_
 from extrusion.pairs import CurvePair, Pair
 from extrusion.pairs3d import COPIES, SurfacePair
 from extrusion.surfaces import FaceTrace, Trace, all_ranks, gather_faces, gather_trace
-from extrusion.system import System, in_words, joined
-from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact, Triplets
+from extrusion.system import System, in_words
+from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact
 
 if TYPE_CHECKING:
     from extrusion.krylov import Krylov
@@ -95,7 +94,7 @@ class Problem(System):
     """
 
     def __init__(self, case: Case, mesh: PlainMesh | HexMesh | None, comm: MPI.Intracomm = MPI.COMM_WORLD) -> None:
-        self.case, self.comm, self.evaluating = case, comm, comm
+        self.case, self.comm = case, comm
         if comm.rank == 0:
             _warn(case)
         bodies = ("billet", "die") if case.die == "elastic" else ("billet",)
@@ -459,29 +458,17 @@ class Problem(System):
     def tangent(self, x: PETSc.Vec, geometric: bool) -> PETSc.Mat:
         """Derivative of the residual; a new matrix whenever its pattern has grown."""
         z = self.gather(x)
-        iterates = self._krylov is not None
-        # with multipliers every rank needs their rows
-        wanted = self.z_free if self.shared or (iterates and self.n_multipliers) else self._z_row
-        D = self._to_rows(self.contact_tangent(z, geometric, wanted, self.z_free))
         if self._krylov is not None:
+            # with multipliers every rank needs their rows
+            wanted = self.z_free if self.n_multipliers else self._z_row
+            D = self.contact_tangent(z, geometric, wanted, self.z_free)
             stiff = [term.stiff(z, self._z_of_billet) for term in self.terms]
             kappa = np.concatenate([part for _, part in stiff])
-            self._krylov.set(D, self._to_rows(joined([part for part, _ in stiff])), kappa)
+            self._krylov.set(D, self.of_all([part for part, _ in stiff], self._z_row, self.z_free), kappa)
             self._iterated.assemble()
             return self._iterated
-        rows, cols, values = D
+        rows, cols, values = self.contact_tangent(z, geometric, self._z_row, self.z_free)
         return self._tangent.fill(self.z_to_x[rows] - self._row0, self.z_to_x[cols], values)
-
-    def _to_rows(self, D: Triplets) -> Triplets:
-        """Triplets of which each rank has a part, if terms are shared: all of this rank's rows."""
-        if not self.shared:
-            return D
-        with self._pairs():
-            rows, cols, values = D
-            mine = scipy.sparse.coo_array((values, (rows, cols)), shape=(self.n_z, self.n_z)).tocsr()
-            parts = self.comm.alltoall([mine[of] for of in self._z_rows_of_ranks])
-            whole = sum(parts[1:], start=parts[0]).tocoo()
-            return self.z_rows[whole.row], whole.col.astype(np.int64), whole.data
 
     def largest_displacement(self, x: PETSc.Vec) -> float:
         """Largest displacement component in x on any rank, multipliers left out."""
@@ -527,11 +514,6 @@ class Problem(System):
     def z_rows(self) -> Index:
         """Entries of z that are unknowns of this rank."""
         return self._z_mine[self._z_row[self._z_mine]]
-
-    @cached_property
-    def _z_rows_of_ranks(self) -> list[Index]:
-        """`z_rows` of each rank."""
-        return list(self.comm.allgather(self.z_rows))
 
     @cached_property
     def x_rows(self) -> Index:

@@ -13,6 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
+import scipy.sparse
 
 from extrusion.cases import Case
 from extrusion.gap import Array, Index
@@ -33,8 +34,7 @@ class System(ABC):
     x: PETSc.Vec
     n_z: int
     n_multipliers: int
-    evaluating: MPI.Intracomm  # ranks that evaluate the terms together
-    shared = False  # whether they do: each a part of the slave facets
+    shared = False  # whether each rank evaluates the terms on a part of the slave facets
     pairing = 0.0  # s, spent so far in finding contact points and evaluating the terms
 
     # -- unknowns --------------------------------------------------------------------------------------------
@@ -111,11 +111,11 @@ class System(ABC):
             for term in self.terms:
                 term.add_residual(z, R)
             if self.shared:
-                self.evaluating.Allreduce(MPI.IN_PLACE, R)
+                self.comm.Allreduce(MPI.IN_PLACE, R)
         return R
 
     def contact_tangent(self, z: Array, geometric: bool, rows: np.ndarray, cols: np.ndarray) -> Triplets:
-        """Its derivative as (rows, columns, values); this rank's part of it where terms are shared.
+        """Its derivative as (rows, columns, values).
 
         Args:
             z: Where.
@@ -123,13 +123,25 @@ class System(ABC):
             rows: Which rows to give, ``shape=(n_z,)``.
             cols: And which columns.
         """
-        parts = []
         with self._pairs():
-            for term in self.terms:
-                i, j, values = term.tangent(z, geometric)
-                keep = rows[i] & cols[j]
-                parts.append((i[keep], j[keep], values[keep]))
-        return joined(parts)
+            return self.of_all([term.tangent(z, geometric) for term in self.terms], rows, cols)
+
+    def of_all(self, parts: list[Triplets], rows: np.ndarray, cols: np.ndarray) -> Triplets:
+        """Some rows and columns of all zones' triplets, and of all ranks' where terms are shared (collective then)."""
+        wanted = np.ones_like(rows) if self.shared else rows
+        kept = []
+        for i, j, values in parts:
+            keep = wanted[i] & cols[j]
+            kept.append((i[keep], j[keep], values[keep]))
+        mine = joined(kept)
+        if not self.shared:
+            return mine
+        i, j, values = mine
+        A = scipy.sparse.coo_array((values, (i, j)), shape=(self.n_z, self.n_z)).tocsr()
+        at = np.flatnonzero(rows)
+        from_ranks = self.comm.alltoall([A[of] for of in self.comm.allgather(at)])
+        whole = sum(from_ranks[1:], start=from_ranks[0]).tocoo()
+        return at[whole.row], whole.col.astype(np.int64), whole.data
 
     @contextmanager
     def _pairs(self) -> Iterator[None]:
@@ -144,7 +156,7 @@ class System(ABC):
     def start(self, x: PETSc.Vec) -> None:
         """Accepted contact state at t = 0."""
         z = self.gather(x)
-        self.shared = all([term.share(self.evaluating) for term in self.terms])
+        self.shared = all([term.share(self.comm) for term in self.terms])
         if not self.shared:
             for term in self.terms:
                 term.share(MPI.COMM_SELF)
