@@ -45,7 +45,7 @@ DAMP = 8
 """Passes after which billet and die are paired halfway between the last two solutions."""
 
 SOFT = 10.0
-"""Contact stiffness gamma that an increment is solved with at once; it is led to a larger one (`_led`)."""
+"""Contact stiffness gamma, by the softer body's modulus, that is solved with at once; to more it is led (`_led`)."""
 
 STIFFEN = 10.0
 """Ratio of the contact stiffness between two solves that lead to a large one."""
@@ -269,7 +269,7 @@ def _led(problem: System, newton: Newton, ahead: float) -> Outcome:
     Where that leads nowhere the increment is solved at once.
     """
     x, case = problem.x, problem.case
-    gamma, at, ratio, iterations = case.contact_gamma, 0.0, STIFFEN, 0
+    gamma, at, ratio, iterations = case.contrast * case.contact_gamma, 0.0, STIFFEN, 0
     soft = SOFT * STIFFEN if case.theta == 1 else SOFT  # which is not coercive below 27 to 36
 
     def following(at: float) -> float:

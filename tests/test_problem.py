@@ -411,6 +411,18 @@ def test_a_stiff_contact_is_led_to() -> None:
     assert apart[1e4] < 0.02 * apart[1e2]
 
 
+@pytest.mark.parametrize("law", ["penalty", "nitsche 0"])
+def test_a_stiff_slave_is_led_to(law: str) -> None:
+    """The die's modulus is 40 times the billet's, and so is its contact stiffness: 8 cuts and 1, if not led to."""
+    zones = (replace(A.zones[0], slave="die"),)
+    case = replace(A, **LAWS[law], order=2, size=4.0, zones=zones, billet=Elastic(5000.0, 0.3))
+    assert (case.contrast, replace(case, zones=A.zones).contrast) == (40.0, 1.0)
+    system = Condensed(Problem(case, case_mesh(A.profile, 4.0), MPI.COMM_SELF))
+    run = list(steps(system, Newton(system), list(np.arange(5.0, 41.0, 5.0))))
+    assert sum(step.cuts for step in run) == 0
+    assert max(step.iterations for step in run) <= 30
+
+
 class Stiff(Newton):
     """Converges, or not, as it is told; x remembers where it has been, by the stiffness."""
 
