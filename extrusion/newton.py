@@ -23,10 +23,6 @@ WATCH = 6
 The watchdog of Chamberlain, Powell, Lemaréchal, Pedersen, Math. Prog. Study 16 (1982) 1, doi:10.1007/BFb0120945.
 """
 
-ROUGHLY = 1e-4
-"""Part of the first residual at which a solve of few iterations may end."""
-
-
 PREDICTED = 1e-3
 """Part of the right-hand side that the solve with the expected contact set may leave."""
 
@@ -150,7 +146,7 @@ class Newton:
             return int(reason.CONVERGED_FNORM_ABS)
         if norm <= self._share * self.history[0]:
             return int(reason.CONVERGED_FNORM_RELATIVE)
-        if it >= self._limit or (self._limit < self._max and norm < ROUGHLY * self.history[0]):
+        if it >= self._limit:
             return int(reason.DIVERGED_MAX_IT)
         return int(reason.ITERATING)
 

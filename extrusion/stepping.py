@@ -38,6 +38,9 @@ ROUGH = 4
 AT_MOST = 1
 """Linear solves of a rough pass, beside the one that takes the contact set of the pass before."""
 
+ROUGHLY = 1e-4
+"""Part of its first residual at which a rough pass may end."""
+
 SETTLE = 3
 """Passes after which a node that rests on a die vertex stays with the facet it had."""
 
@@ -55,6 +58,9 @@ LEAST = 1.5
 
 LED = 1e-2
 """Part of its first residual at which a solve on the way may end."""
+
+PATIENCE = 20
+"""Linear solves on the way to a stiffness before a shorter one is tried."""
 
 PASS_TOLERANCE = 0.01
 """Passes stop when the displacement increment changes by less than this part of itself (the sheet's RESI_GEOM)."""
@@ -227,7 +233,8 @@ def _increment(problem: System, newton: Newton, accepted: PETSc.Vec, ahead: floa
         x.copy(previous)
         rough &= attempt <= ROUGH
         if frozen:
-            outcome = newton.solve(x, AT_MOST if rough else None, 0.0 if attempt > 1 else ahead)
+            few, share = (AT_MOST, ROUGHLY) if rough else (None, 0.0)
+            outcome = newton.solve(x, few, 0.0 if attempt > 1 else ahead, share)
         else:
             outcome = _led(problem, newton, ahead)
         iterations += outcome.iterations
@@ -284,7 +291,7 @@ def _led(problem: System, newton: Newton, ahead: float) -> Outcome:
         while True:
             goal = following(at)
             problem.soften(goal / gamma)
-            outcome = newton.solve(x, ahead=None if at else ahead, share=0.0 if goal == gamma else LED)
+            outcome = newton.solve(x, PATIENCE if at else None, None if at else ahead, 0.0 if goal == gamma else LED)
             iterations += outcome.iterations
             if outcome.converged:
                 if goal == gamma:

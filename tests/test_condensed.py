@@ -134,3 +134,15 @@ def test_prediction_saves_iterations() -> None:
         sum(s.iterations for s in steps(system, Newton(system, predicts=p), times)) for p in (True, False)
     )
     assert with_ < 0.8 * without
+
+
+@pytest.mark.parametrize("surface", [True, False])
+def test_a_soft_slave_goes_through(surface: bool) -> None:
+    """With linear solves to a hundredth the surface stopped at t = 15, where the solve with all unknowns goes on."""
+    side = replace(cases.SIDE, slave="die")
+    case = replace(cases.A, method="nitsche", order=2, size=1.0, zones=(side,), billet=cases.Elastic(5000.0, 0.3))
+    problem = scene(replace(case, die_material=cases.Elastic(2000.0, 0.3)))
+    system = Condensed(problem) if surface else problem
+    *_, step = steps(system, Newton(system), [10.0, 15.0, 20.0, 25.0])
+    assert step.cuts == 0
+    assert step.reaction == pytest.approx(224.66e3, abs=10)

