@@ -260,13 +260,12 @@ class Case:
         """The dimensionless contact stiffness in force."""
         return GAMMA[self.method] if self.gamma is None else self.gamma
 
-    @property
-    def contrast(self) -> float:
-        """How many times stiffer a slave, whose modulus scales the contact stiffness, is than its master, or 1."""
-        if self.die == "rigid":
+    def contrast(self, zone: Zone) -> float:
+        """How many times stiffer a zone's slave, which scales its contact stiffness, is than its master; at least 1."""
+        if self.die == "rigid" or zone.contact == "check":
             return 1.0
         of_billet = self.billet.E / self.die_material.E
-        return max(1.0, *(of_billet if zone.slave == "billet" else 1 / of_billet for zone in self.zones))
+        return max(1.0, of_billet if zone.slave == "billet" else 1 / of_billet)
 
     def along_ray(self, zone: Zone) -> bool:
         """Whether a zone's gap is measured along its ray (else to the closest point)."""

@@ -387,20 +387,22 @@ class Condensed(System):
     # -- equations -------------------------------------------------------------------------------------------
 
     def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        out = f.array  # on every rank: PETSc counts changes, and forgets the norm
         try:
-            out[1:] = self._out_of_balance(x, self._evaluated(x))
-            out[:1] = 0.0
+            values = self._out_of_balance(x, self._evaluated(x))
         except ArithmeticError:
-            out[:] = np.nan
+            f.set(np.nan)
+            return
+        out = f.array  # on every rank: PETSc counts changes, and forgets the norm
+        out[1:] = values
+        out[:1] = 0.0
 
     def _evaluated(self, x: PETSc.Vec) -> Array:
-        """The contact vector, where terms are evaluated: on rank 0, or if they are shared on all."""
-        return self.gather(x) if self.shared else self._z(x) if self.on_root else np.zeros(0)
+        """The contact vector, where terms are evaluated: on rank 0, or if they are divided on all."""
+        return self.gather(x) if self.divided else self._z(x) if self.on_root else np.zeros(0)
 
     def _out_of_balance(self, x: PETSc.Vec, z: Array) -> Array:
         """The residual's rows of forces and multipliers, on rank 0; z is given where it is `_evaluated`."""
-        R = self.contact_forces(z) if self.on_root or self.shared else np.zeros(0)
+        R = self.contact_forces(z) if self.on_root or self.divided else np.zeros(0)
         if not self.on_root:
             return np.zeros(0)
         out = np.concatenate([R[self.z_forced], R[self.n_z - self.n_multipliers :]])
@@ -410,7 +412,7 @@ class Condensed(System):
     def tangent(self, x: PETSc.Vec, geometric: bool) -> PETSc.Mat:
         D, f = None, np.zeros(0)
         z = self._evaluated(x)
-        if self.on_root or self.shared:
+        if self.on_root or self.divided:
             wanted = (self._force_of_z >= 0) & self.on_root
             rows, cols, values = self.contact_tangent(z, geometric, wanted, self._row_of_z >= 0)
         if self.on_root:

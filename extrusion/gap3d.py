@@ -254,7 +254,7 @@ def _meet_facets(
         A = np.stack([x_k, x_l, -N], axis=-1)
         if not np.isfinite(A).all():
             break
-        inverse = np.linalg.inv(A)
+        inverse = _inverse(A)
         step = np.einsum("nqij,nqj->nqi", inverse, out)
         k = np.where(beyond[:, None], k, k - step[..., 0])
         reach = np.where(beyond[:, None], reach - step[..., 0], reach)
@@ -277,6 +277,13 @@ def _meet_facets(
         (c_kk, c_kl, c_ll),
     )  # fmt: skip
     return met, np.where(beyond[:, None], edge + np.where(edge > 0.5, 1, -1) * np.abs(reach), k), l
+
+
+def _inverse(A: Array) -> Array:
+    try:
+        return np.linalg.inv(A)
+    except np.linalg.LinAlgError:
+        raise ArithmeticError("a ray does not meet the die") from None
 
 
 class _Rows:
@@ -544,7 +551,7 @@ class _Rings:
             x, tangent = (np.einsum("nk,nki->ni", lagrange(n_s, xi, d), curve) for d in (0, 1))
             out = np.einsum("nk,nki->ni", L, nodes) - x - gap[:, None] * N
             B = np.stack([np.einsum("nk,nki->ni", L_l, nodes), -tangent, -N], axis=-1)
-            inverse = np.linalg.inv(B)
+            inverse = _inverse(B)
             step = np.einsum("nij,nj->ni", inverse, out)
             l, xi, gap = l - step[:, 0], xi - step[:, 1], gap - step[:, 2]  # noqa: E741
             if np.max(np.abs(step)) < 1e-13 * max(1.0, float(np.abs(x).max())):

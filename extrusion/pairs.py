@@ -118,8 +118,8 @@ class Pair(ABC):
         ``keep``: die facets to stay with, from `facing`, where points are not split at the facets' edges.
         """
 
-    def share(self, facets: Index) -> Pair | None:
-        """The same pair with the `points` of these slave facets alone; None where that would not pay."""
+    def part(self, facets: Index) -> Pair | None:
+        """The same pair with the `points` of these slave facets alone; None if it gives only those of all."""
         return None
 
     def touches(self, z: Array, points: Points, radius: float, interpenetrating: bool) -> np.ndarray:

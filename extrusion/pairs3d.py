@@ -36,7 +36,7 @@ class SurfacePair(Pair):
 
     slave: Facets
     die: Facets | Revolved
-    shared: Index | None = None  # the slave facets of which `points` gives those of
+    facets: Index | None = None  # `points` are those of these slave facets; None: of all
 
     dim = 3
     copies = COPIES
@@ -100,8 +100,8 @@ class SurfacePair(Pair):
             points = line_points(some, self.die, z, self.sign, order, variation)
         else:
             points = scattered_points(some, self.die, z, self.axis, self.sign, order, self.ray, self.smooth, keep)
-        if self.shared is not None:
-            points = replace(points, facet=self.shared[points.facet])
+        if self.facets is not None:
+            points = replace(points, facet=self.facets[points.facet])
         if material is None:
             return points, None, None
         n_u, n_points = 3 * slave.cell_nodes.shape[1], points.G.shape[2]
@@ -129,12 +129,12 @@ class SurfacePair(Pair):
             points = widened(points, slave.pressure_cols[points.facet])
         return points, S, S_xi
 
-    def share(self, facets: Index) -> SurfacePair:
-        return replace(self, shared=facets)
+    def part(self, facets: Index) -> SurfacePair:
+        return replace(self, facets=facets)
 
     @cached_property
     def _some(self) -> Facets:
-        return self.slave if self.shared is None else self.slave.take(self.shared)
+        return self.slave if self.facets is None else self.slave.take(self.facets)
 
     def touches(self, z: Array, points: Points, radius: float, interpenetrating: bool) -> np.ndarray:
         # between its nodes a facet that touches is off the circle by a little: what counts are the nodes

@@ -2,8 +2,9 @@
 
 The unknown x holds, on each rank, the displacement of both bodies in one Lagrange space (one mesh, two unconnected
 parts), the billet's pressure if the form is mixed, and, on the last rank, at its end, the multipliers. The bulk
-stiffness K is constant; contact adds a few sparse rows, computed from the surfaces, which every rank holds whole: in
-space each rank finds the contact points of a part of the slave's facets, else all of them, and keeps the rows it owns.
+stiffness K is constant; contact adds a few sparse rows, computed from the surfaces, which every rank holds whole, and
+of which it keeps those it owns. Each rank finds all contact points, or those of a part of the slave's facets
+(`ContactTerm.divide`).
 """
 
 from __future__ import annotations

@@ -273,41 +273,53 @@ def _led(problem: System, newton: Newton, ahead: float) -> Outcome:
     Where the gap is curved or changes facet an update is off by some part of its square; times a large stiffness that
     is a large force, which Newton's method answers by letting go. From a softer contact's solution the update is as
     short as that contact's penetration: ten times the stiffness then costs two to five solves, whatever the stiffness.
-    Where that leads nowhere the increment is solved at once.
+    Where that leads nowhere the increment is solved at once; and so it is at first where contact is only stiff because
+    a slave is the stiffer body.
     """
     x, case = problem.x, problem.case
-    gamma, at, ratio, iterations = case.contrast * case.contact_gamma, 0.0, STIFFEN, 0
-    soft = SOFT * STIFFEN if case.theta == 1 else SOFT  # which is not coercive below 27 to 36
+    if case.method not in ("penalty", "nitsche"):
+        return newton.solve(x, ahead=ahead)
+    soft = SOFT * STIFFEN if case.theta == 1 else SOFT  # which is not coercive below 27 to 36, by the slave's modulus
+    stiffest = case.contact_gamma * (1.0 if case.theta == 1 else max(case.contrast(zone) for zone in case.zones))
+    iterations, at, ratio = 0, 0.0, STIFFEN
 
-    def following(at: float) -> float:
+    def following(at: float, end: float) -> float:
         goal = max(soft, ratio * at)
-        return gamma if goal > gamma / np.sqrt(ratio) else goal  # no further solve for a ratio as small as that
+        return end if goal > end / np.sqrt(ratio) else goal  # no further solve for a ratio as small as that
 
-    if case.method not in ("penalty", "nitsche") or following(at) == gamma:
+    if following(0.0, stiffest) == stiffest:
         return newton.solve(x, ahead=ahead)
     predicted, reached = x.duplicate(), x.duplicate()
     x.copy(predicted)
+    at_once = following(0.0, case.contact_gamma) == case.contact_gamma
+    if at_once:
+        outcome = newton.solve(x, ahead=ahead)
+        if outcome.converged:
+            return outcome
+        iterations += outcome.iterations
+        predicted.copy(x)
     try:
         while True:
-            goal = following(at)
-            problem.soften(goal / gamma)
-            outcome = newton.solve(x, PATIENCE if at else None, None if at else ahead, 0.0 if goal == gamma else LED)
+            goal = following(at, stiffest)
+            problem.soften(goal if goal < stiffest else None)
+            outcome = newton.solve(x, PATIENCE if at else None, None if at else ahead, LED if goal < stiffest else 0.0)
             iterations += outcome.iterations
             if outcome.converged:
-                if goal == gamma:
+                if goal == stiffest:
                     break
                 at = goal
                 x.copy(reached)
                 continue
-            while at and ratio > LEAST and following(at) >= goal:
+            while at and ratio > LEAST and following(at, stiffest) >= goal:
                 ratio **= 0.5
-            if not at or following(at) >= goal:  # at once
-                predicted.copy(x)
-                problem.soften(1.0)
-                outcome = newton.solve(x, ahead=ahead)
-                iterations += outcome.iterations
+            if not at or following(at, stiffest) >= goal:
+                if not at_once:
+                    predicted.copy(x)
+                    problem.soften(None)
+                    outcome = newton.solve(x, ahead=ahead)
+                    iterations += outcome.iterations
                 break
             reached.copy(x)
     finally:
-        problem.soften(1.0)
+        problem.soften(None)
     return replace(outcome, iterations=iterations)

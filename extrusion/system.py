@@ -34,7 +34,6 @@ class System(ABC):
     x: PETSc.Vec
     n_z: int
     n_multipliers: int
-    shared = False  # whether each rank evaluates the terms on a part of the slave facets
     pairing = 0.0  # s, spent so far in finding contact points and evaluating the terms
 
     # -- unknowns --------------------------------------------------------------------------------------------
@@ -104,13 +103,18 @@ class System(ABC):
     def round_off(self, x: PETSc.Vec) -> float:
         """Norm of the round-off in the residual at x, N."""
 
+    @property
+    def divided(self) -> bool:
+        """Whether each rank evaluates the terms on a part of the slave's facets (all of them, or none)."""
+        return any(term.divided for term in self.terms)
+
     def contact_forces(self, z: Array) -> Array:
         """Contact's part of the residual over z, N (and multiplier rows)."""
         R = np.zeros(self.n_z)
         with self._pairs():
             for term in self.terms:
                 term.add_residual(z, R)
-            if self.shared:
+            if self.divided:
                 self.comm.Allreduce(MPI.IN_PLACE, R)
         return R
 
@@ -127,14 +131,14 @@ class System(ABC):
             return self.of_all([term.tangent(z, geometric) for term in self.terms], rows, cols)
 
     def of_all(self, parts: list[Triplets], rows: np.ndarray, cols: np.ndarray) -> Triplets:
-        """Some rows and columns of all zones' triplets, and of all ranks' where terms are shared (collective then)."""
-        wanted = np.ones_like(rows) if self.shared else rows
+        """Some rows and columns of all zones' triplets, and of all ranks' where terms are divided (collective then)."""
+        wanted = np.ones_like(rows) if self.divided else rows
         kept = []
         for i, j, values in parts:
             keep = wanted[i] & cols[j]
             kept.append((i[keep], j[keep], values[keep]))
         mine = joined(kept)
-        if not self.shared:
+        if not self.divided:
             return mine
         i, j, values = mine
         A = scipy.sparse.coo_array((values, (i, j)), shape=(self.n_z, self.n_z)).tocsr()
@@ -154,12 +158,11 @@ class System(ABC):
     # -- contact state ---------------------------------------------------------------------------------------
 
     def start(self, x: PETSc.Vec) -> None:
-        """Accepted contact state at t = 0."""
+        """Accepted contact state at t = 0; from here on ranks evaluate the terms together, if these can be divided."""
         z = self.gather(x)
-        self.shared = all([term.share(self.comm) for term in self.terms])
-        if not self.shared:
+        if not all([term.divide(self.comm) for term in self.terms]):
             for term in self.terms:
-                term.share(MPI.COMM_SELF)
+                term.divide(MPI.COMM_SELF)
         for term in self.terms:
             term.start(z)
 
@@ -201,10 +204,12 @@ class System(ABC):
         for term in self.terms:
             term.hold(z)
 
-    def soften(self, share: float) -> None:
-        """Take this part of the contact stiffness from now on, where contact has one (`ContactTerm.soften`)."""
-        for term in self.terms:
-            term.soften(share)
+    def soften(self, gamma: float | None) -> None:
+        """Take at most this contact stiffness, by the softer body's modulus, from now on; None: what the case says."""
+        case = self.case
+        for term, zone in zip(self.terms, case.zones, strict=True):
+            own = case.contact_gamma * case.contrast(zone)
+            term.soften(1.0 if gamma is None else min(1.0, gamma / own))
 
     def expect(self, ahead: float | None) -> bool:
         """Take the contact set that is expected as given (`ContactTerm.expect`); say if any zone has one."""

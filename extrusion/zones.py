@@ -31,11 +31,12 @@ class ContactTerm(Protocol):
     multipliers: int
     forced: Index  # displacements (and pressures) in z that the term can put a force on, in order along slave and die
     caught: float  # mm: how far from the die the farthest point was that the last `start` or `accept` closed for good
+    divided: bool  # whether each rank evaluates a part of the slave's facets
 
-    def share(self, comm: MPI.Intracomm) -> bool:
+    def divide(self, comm: MPI.Intracomm) -> bool:
         """From now on add to residual and tangent what this rank's part of the slave's facets does, and say if so.
 
-        All methods are collective then. On one rank, or where it would not pay: what all facets do.
+        What looks at contact points is collective then. On one rank, or if it cannot: what all facets do.
         """
 
     def start(self, z: Array) -> None:
@@ -248,6 +249,8 @@ class NodalContact:
     A node that flips between two facets of the die rests on the vertex between them (`_Resting`).
     """
 
+    divided = False
+
     def __init__(self, pair: Pair, first: int, stiffness: Array, radius: float, interpenetrating: bool = False) -> None:
         self.pair = pair
         self.nodes, self.X, self.weight = pair.nodes, pair.X, pair.nodal_weights()
@@ -262,7 +265,7 @@ class NodalContact:
         self._last: np.ndarray | None = None  # nodes that the last pairing's solve left closed
         self._expects = False
 
-    def share(self, comm: MPI.Intracomm) -> bool:
+    def divide(self, comm: MPI.Intracomm) -> bool:
         return False
 
     def start(self, z: Array) -> None:
@@ -424,15 +427,16 @@ class IntegratedContact:
         self._expected = Expected()
         self._is_far = _Latest(lambda z: pair.is_far(z, radius))
         self._held: Index | None = None
-        self.share(MPI.COMM_SELF)
+        self.divide(MPI.COMM_SELF)
 
-    def share(self, comm: MPI.Intracomm) -> bool:
+    def divide(self, comm: MPI.Intracomm) -> bool:
         mine = None
         if 1 < comm.size <= len(self.closed):  # no part is empty
-            mine = self.pair.share(np.arange(comm.rank, len(self.closed), comm.size))  # what is closed is in one place
+            mine = self.pair.part(np.arange(comm.rank, len(self.closed), comm.size))  # what is closed is in one place
         self._comm, self._mine = (MPI.COMM_SELF, self.pair) if mine is None else (comm, mine)
         self._points = _Latest(self._find)
-        return mine is not None
+        self.divided = mine is not None
+        return self.divided
 
     def _of_all(self, facet: Index, *rows: np.ndarray) -> tuple[np.ndarray, ...]:
         """Rows that belong to facets, of all ranks and in the facets' order."""
@@ -494,14 +498,15 @@ class IntegratedContact:
 
     def _find(self, z: Array) -> tuple[Points, Array | None, Array | None]:
         """Contact points with the rows of the slave's own stress and their derivative, over the points' columns."""
-        lost = ""
+        found, lost = None, ""
         try:
             found = self._mine.points(z, self._order, self.pair.closure != "check", self._material, self._held)
-        except (ArithmeticError, np.linalg.LinAlgError) as error:
+        except ArithmeticError as error:
             lost = str(error)
         if self._comm.size > 1:
-            lost = max(self._comm.allgather(lost))
-        if lost:
+            told = [message for one, message in self._comm.allgather((found is None, lost)) if one]
+            found, lost = (None, told[0]) if told else (found, "")
+        if found is None:
             raise ArithmeticError(lost)
         return found
 
@@ -633,6 +638,7 @@ class MortarContact:
     """
 
     FACING = 0.3
+    divided = False
 
     def __init__(
         self,
@@ -660,7 +666,7 @@ class MortarContact:
         self._points = _Latest(self._find)
         self._held: Index | None = None
 
-    def share(self, comm: MPI.Intracomm) -> bool:
+    def divide(self, comm: MPI.Intracomm) -> bool:
         return False
 
     def hold(self, z: Array | None) -> None:

@@ -280,7 +280,7 @@ def test_billet_between_E_and_F(law: str, element: str) -> None:
         ("nitsche -1", "hex8", "elastic", "die"),
     ],
 )
-def test_shared_facets(
+def test_divided_facets(
     law: str, element: str, die: str, slave: str, solver: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ranks with a part of the slave's facets each do together what one does with all of them."""
@@ -290,7 +290,7 @@ def test_shared_facets(
     systems: list[System] = [Condensed(problem) if solver == "surface" else problem for problem in problems]
     together, alone = systems
     for term in alone.terms:
-        monkeypatch.setattr(term, "share", lambda comm: False)
+        monkeypatch.setattr(term, "divide", lambda comm: False)
     taken, cycles = [], []
     for problem, system in zip(problems, systems, strict=True):
         if solver == "iterative":
@@ -299,7 +299,7 @@ def test_shared_facets(
         *_, step = steps(system, newton, [20.0, 26.0])
         taken.append(step)
         cycles.append(newton.snes.getLinearSolveIterations())
-    assert (together.shared, alone.shared) == (comm.size > 1, False)
+    assert (together.divided, alone.divided) == (comm.size > 1, False)
     assert taken[0].iterations == taken[1].iterations
     assert cycles[0] == cycles[1]
     for name, state in taken[0].zones.items():
@@ -342,12 +342,22 @@ def test_shared_facets(
         side.accept(z)
     assert sides[0].caught == pytest.approx(sides[1].caught)
     assert law != "penalty" or sides[0].caught > 1e-3
-    assert not IntegratedContact.share(sides[1], SimpleNamespace(rank=0, size=10**6))  # some ranks would have none
+    assert not IntegratedContact.divide(sides[1], SimpleNamespace(rank=0, size=10**6))  # some ranks would have none
 
     corner = sides[0].pair.slave.vertices[0, 0]  # of one facet alone
     z[3 * corner] = np.nan
     with pytest.raises(ArithmeticError):  # on every rank
         together.contact_forces(z)
+
+
+@pytest.mark.mpi
+def test_the_problem_knows_that_facets_are_divided() -> None:
+    """Observers of a surface solve are given the problem, whose terms are the surface's."""
+    problem = in_space(comm=MPI.COMM_WORLD, order=1, **LAWS["nitsche 0"])
+    step = last(Condensed(problem), [20.0])
+    rear, die = problem.reactions(step.x)
+    assert rear == pytest.approx(step.reaction, abs=1e-3)
+    assert die == pytest.approx(-rear, abs=1e-3)
 
 
 # -- balances, and other ways to the same answer ---------------------------------------------------------------
