@@ -271,11 +271,13 @@ def _without_open_zones(scene: Case, size: float, comm: MPI.Intracomm) -> tuple[
         return scene, []
     coarse, _ = solve(dataclasses.replace(scene, die="rigid", size=size), comm)
     keep, parts = [scene.zones[0]], []
+    end = max(scene.profile.points[name][1] for name in scene.profile.bore)
+    past = max(float(np.max(step.zones[keep[0].name].x[:, 1])) for step in coarse) > end
     for zone in scene.zones[1:]:
         least = min(float(np.min(step.zones[zone.name].gap)) for step in coarse)
         wide = least > OPEN * scene.profile.radius
-        # a glissière with another zone is not let go past the die's end: without it, it would be
-        if wide and scene.zones[0].contact != "bilateral":
+        # with another zone nothing is let go past the die's end: without it, it would be
+        if wide and not past and scene.zones[0].contact != "bilateral":
             parts.append(Part(f"no zone {zone.name} (its gap is never below {least:.3g} mm)", True, NONE))
         else:
             keep.append(zone)

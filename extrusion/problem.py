@@ -299,8 +299,10 @@ class Problem(System):
         material, sign = case.billet, 1.0
         if zone.slave == "die":
             slave, master, material, sign = master, slave, case.die_material, -1.0
-        # past its ends the die goes on straight; but what a glissière without a second zone pushes past F is let go
-        extended = zone.contact != "bilateral" or len(case.zones) > 1
+        # past its ends the die goes on straight, to where another zone takes over; without one a side that passes, and
+        # what a glissière holds, is let go (past the cone's ends there is the bore)
+        follows = len(case.zones) > 1 or (zone.billet == "front" and zone.contact != "bilateral")
+        extended = zone.contact == "check" or follows
         extended &= (zone.slave, zone.billet) != ("die", "side")  # the bore goes on where the billet does not
         common: dict[str, Any] = dict(
             name=zone.name, slave=slave, die=master, axis=AXIS[zone.ray], sign=sign, closure=zone.contact,

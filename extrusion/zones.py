@@ -837,6 +837,8 @@ class MortarContact:
         if self.multipliers:
             lam, dsc = z[self.at], self._law(z, points)[1]
             stress = self._pressure(points, lam)
+            if not self.pair.extended:
+                stress = np.where(points.past, 0.0, stress)  # as `_rows` weighs it
             nearest = np.argmax(self.pair.hats(points)[0], axis=-1)
             closed = np.take_along_axis(dsc[self._ends[points.facet]], nearest, axis=1) > 0
         return self.pair.report(z, points, stress, closed)

@@ -22,6 +22,7 @@ from extrusion.errors import InputError, StepError
 from extrusion.mesh import PlainMesh, case_mesh
 from extrusion.newton import WATCH, Newton, Outcome
 from extrusion.problem import Problem
+from extrusion.profile import Profile
 from extrusion.stepping import Step, _led, steps
 from extrusion.zones import ContactState, NodalContact
 
@@ -433,6 +434,31 @@ def test_one_stiff_slave_leaves_the_other_zones_alone() -> None:
     run = list(steps(system, Newton(system), case.times()))
     assert sum(step.cuts for step in run) == 0
     assert run[-1].energy == pytest.approx(203.75e6, rel=1e-3)
+
+
+@pytest.mark.parametrize("law", ["nodal", "mortar", "penalty", "nitsche 0"])
+@pytest.mark.parametrize("die", ["elastic", "rigid"])
+def test_the_open_end_of_a_die(law: str, die: str) -> None:
+    """What has left a die that no other zone follows is free: its last line is not there to hold it."""
+    at = {"A": (8.0, 0.0), "B": (8.0, 22.0), "C": (7.9, 26.0), "D": (7.9, 30.0), "E": (20.0, 30.0), "F": (20.0, 0.0)}
+    parts = [(a, b, n) for (a, b), n in zip(pairwise("ABCDEF"), (22, 4, 4, 12, 30), strict=True)]
+    profile = Profile(
+        die=tuple((name, *point) for name, point in at.items()), bore=("A", "B", "C", "D"), cone=(),
+        fixed=(("E", "F"),), radius=8.0, length=20.0, divisions=(*parts, ("F", "A", 12)),
+    )  # fmt: skip
+    case = Case(
+        name="wire", profile=profile, billet=Elastic(70000.0, 0.33), die=die, zones=(SIDE,),
+        increments=((1.0, 40.0),), size=1.0, order=2, **LAWS[law],
+    )  # fmt: skip
+    system = Condensed(Problem(case, case_mesh(profile, 1.0), MPI.COMM_SELF))
+    *_, half, last = steps(system, Newton(system), [*np.arange(1.0, 21.0), 40.0])
+    out = half.zones["1"].x[:, 1] > 30.5
+    assert out.sum() > 5
+    assert_allclose(half.zones["1"].pressure[out], 0.0, atol=1e-6)
+    assert np.max(half.zones["1"].pressure) > 100
+    if law != "nodal":
+        assert half.reaction > 0
+        assert last.reaction == pytest.approx(0.0, abs=1e-3)  # the billet has left the die but for its end
 
 
 class Stiff(Newton):
