@@ -137,10 +137,14 @@ class Case:
             or not self.name
             or not set(self.name).isdisjoint("/\\\0")
             or self.name[0] == "."
+            or self.name != self.name.strip()
+            or not self.name.isprintable()
         ):
             raise InputError("name", self.name, "give the case a name that can name a folder")
         if not isinstance(self.title, str):
             raise InputError("title", self.title, "give a text")
+        if self.mesh is not None and not (isinstance(self.mesh, str) and self.mesh):
+            raise InputError("mesh", self.mesh, "give the name of a mesh file")
         _choose(
             self, method=METHODS, order=(1, 2), theta=(-1, 0, 1), die=("elastic", "rigid"),
             space=("axisymmetric", "plane strain", "3d"), element=("lagrange", "serendipity"),
@@ -367,6 +371,9 @@ def from_dict(data: Mapping[str, Any]) -> Case:
         if not isinstance(rows, list):
             raise InputError("increments", rows, "give a list of pairs [increment, up to t]")
         values["increments"] = tuple(tuple(row) if isinstance(row, list) else row for row in rows)
+    for key in ("billet", "die_material"):
+        if key in data:
+            raise InputError(key, data[key], "unknown key; materials stand in [materials.billet] and [materials.die]")
     return _build(Case, "", {**data, **values}, reserved=("billet", "die_material"), given=values)
 
 

@@ -97,7 +97,10 @@ def run(
     ] = None,
     mesh: Annotated[Path | None, typer.Option(metavar="FILE", help="Mesh (.msh, .med) in place of the case's.")] = None,
     space: Annotated[
-        str | None, typer.Option(metavar="axisymmetric|3d", help="The half-plane, or a quarter in three dimensions.")
+        str | None,
+        typer.Option(
+            metavar="axisymmetric|3d|plane strain", help="The half-plane, a quarter in three dimensions, or a slab."
+        ),
     ] = None,
     sectors: Annotated[int | None, typer.Option(metavar="N", help="In 3d: elements over the quarter turn.")] = None,
     element: Annotated[
@@ -222,9 +225,12 @@ def verify(
         "",
     ):
         table.add_column(name, justify="left" if name in ("case", "contact", "figure", "") else "right")
+    chosen = [_load(name) for name in cases] if cases else [*CASES.values()]
+    for case in chosen:
+        result.refuse_unverifiable(case)
     _start()
     errors, ok = [], True
-    for case in [_load(name) for name in cases] if cases else CASES.values():
+    for case in chosen:
         with _progress(case, quiet) as observers:
             results = result.verify(case, observers=observers)
         for one in results:
@@ -277,20 +283,22 @@ def study(
     if _rank() != 0:
         return
     path = out / "hard-cases.csv"
-    _check_writable("out", path)
+    _check_writable("--out", path)
 
     def tell(number: int, of: int, cell: hard_cases.Cell, outcome: hard_cases.Outcome) -> None:
         which = f"{cell.problem} {cell.die} {cell.method} P{cell.order} nu {cell.nu:g} {cell.increment:g} mm"
         print(f"{number} of {of}: {which}: {outcome.status} {outcome.note}", file=sys.stderr)
 
-    rows = hard_cases.run(path, tell)
+    with _writing("--out"):
+        rows = hard_cases.run(path, tell)
     table = Table(box=SIMPLE_HEAD, padding=0)
     for column in ("part, method", "cells", "converged", "excluded", "failed"):
         table.add_column(column, justify="right")
     for row in hard_cases.summary(rows):
         table.add_row(*map(str, row))
     Console().print(table)
-    hard_cases.draw(rows, path.with_suffix(".png"))
+    with _writing("--out"):
+        hard_cases.draw(rows, path.with_suffix(".png"))
 
 
 def _verify_estimates(quiet: bool) -> None:
@@ -340,9 +348,9 @@ def bench(
         told = outcome.note or f"{outcome.wall:.2f} s, {outcome.iterations} iterations"
         _say(f"{number} of {of}: {cell}: {outcome.status}, {told}")
 
-    with _as_options({"out"}):
+    with _as_options({"out"}), _writing("--out"):
         here, runs = speed.run(out, quick=quick, progress=tell)
-    print(speed.write(out, here, runs))
+        print(speed.write(out, here, runs))
 
 
 @app.command()
@@ -545,6 +553,17 @@ def _check_writable(field: str, path: Path) -> None:
         folder = folder.parent
     if path.is_dir() or not folder.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
         raise InputError(field, str(path), "cannot be written; give another file")
+
+
+@contextmanager
+def _writing(field: str) -> Iterator[None]:
+    """A file that cannot be written after all is told as the field's."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            raise
+        raise InputError(field, str(error.filename), f"cannot be written ({error.strerror})") from None
 
 
 def _write_json(result: Result, path: Path | None) -> None:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -414,9 +416,10 @@ def _triangulate(
     for option in ("MeshSizeExtendFromBoundary", "MeshSizeFromPoints", "MeshSizeFromCurvature"):
         gmsh.option.setNumber(f"Mesh.{option}", 0)
     gmsh.option.setNumber("Mesh.Algorithm", 6)  # frontal Delaunay
-    mesh.setSizeCallback(lambda dim, tag, x, y, z, lc: size(x, y))
     try:
-        mesh.generate(2)
+        with _interrupted_after() as interrupted:
+            mesh.setSizeCallback(lambda dim, tag, x, y, z, lc: lc if interrupted else size(x, y))
+            mesh.generate(2)
     except Exception as error:  # gmsh raises nothing narrower
         names = "-".join(a for a, _ in polygon)
         raise InputError("profile", names, f"gmsh could not mesh this outline: {error}") from None
@@ -436,6 +439,22 @@ def _triangulate(
     part = _Part(x.reshape(-1, 3)[:, :2].copy(), local(2, surface, 3), {k: np.vstack(f) for k, f in facets.items()})
     gmsh.model.remove()
     return part
+
+
+@contextmanager
+def _interrupted_after() -> Iterator[list[int]]:
+    """Ctrl-C takes effect at the end; until then it is listed. In a callback gmsh would take it for any size."""
+    before, heard = signal.getsignal(signal.SIGINT), list[int]()
+    listens = threading.current_thread() is threading.main_thread() and callable(before)
+    if listens:
+        signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
+    try:
+        yield heard
+    finally:
+        if listens:
+            signal.signal(signal.SIGINT, before)
+    if heard and callable(before):
+        before(signal.SIGINT, None)
 
 
 def read_mesh(path: str | Path, needed: Sequence[str] = ()) -> PlainMesh:

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import tomllib
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from extrusion.cases import Case, from_dict
+from extrusion.cases import Case, Zone, from_dict
 from extrusion.errors import InputError
 from extrusion.result import PICTURED, Array, Result, Snapshots, element_name, per_thickness
 
@@ -35,18 +36,21 @@ class Record:
     t: Array  # (steps,) mm
     u_y_K: Array  # (steps,) mm
     reaction: Array  # (steps,) N
-    pressure: dict[float, tuple[Array, Array]]  # t -> y (mm) and pressure (MPa) along the side
+    pressure: dict[float, tuple[Array, Array]]  # t -> y (mm) and pressure (MPa) along the side; or r, along the front
     snapshots: Snapshots | None
 
     @classmethod
     def of(cls, result: Result) -> Record:
         """The record of a run, on rank 0."""
-        zone = _side_zone(result.case)
+        zone = _pictured_zone(result.case)
         pressure = {}
         for step in result.steps:
-            if zone in step.zones:
-                state = step.zones[zone]
-                pressure[step.t] = state.x[:, 1], state.pressure
+            if zone.name in step.zones:
+                state = step.zones[zone.name]
+                place = (
+                    state.x[:, 1] if zone.billet == "side" else np.linalg.norm(np.delete(state.x, 1, axis=1), axis=1)
+                )
+                pressure[step.t] = place, state.pressure
         return cls(result.case, result.t, result.point("K")[:, 1], result.reaction, pressure, result.snapshots)
 
     @classmethod
@@ -57,36 +61,42 @@ class Record:
             InputError: A file is missing or is not what a run writes.
         """
         folder = Path(folder)
+        reading = "run.json"
         try:
-            with (folder / "run.json").open(encoding="utf-8") as file:
+            with (folder / reading).open(encoding="utf-8") as file:
                 case = from_dict(tomllib.loads(json.load(file)["toml"]))
-            with (folder / "history.csv").open(encoding="utf-8", newline="") as file:
+            reading = "history.csv"
+            with (folder / reading).open(encoding="utf-8", newline="") as file:
                 rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
             t, u_y_K, reaction = (np.array([row[k] for row in rows]) for k in ("t", "u_y_K", "reaction"))
             points: dict[float, list[tuple[float, float]]] = {}
-            zone = _side_zone(case)
+            zone = _pictured_zone(case)
+            along = ("y",) if zone.billet == "side" else ("x", "z") if case.space == "3d" else ("r",)
             if rows:
-                with (folder / "contact.csv").open(encoding="utf-8", newline="") as file:
+                reading = "contact.csv"
+                with (folder / reading).open(encoding="utf-8", newline="") as file:
                     for row in csv.DictReader(file):
-                        if row["zone"] == zone:
-                            points.setdefault(float(row["t"]), []).append((float(row["y"]), float(row["pressure"])))
+                        if row["zone"] == zone.name:
+                            place = float(np.hypot.reduce([float(row[name]) for name in along]))
+                            points.setdefault(float(row["t"]), []).append((place, float(row["pressure"])))
             snapshots = None
-            if (folder / "snapshots.npz").exists():
-                with np.load(folder / "snapshots.npz") as data:
+            reading = "snapshots.npz"
+            if (folder / reading).exists():
+                with np.load(folder / reading) as data:
                     snapshots = Snapshots(**data)
         except FileNotFoundError as error:
             raise InputError(
                 "DIR", str(folder), f"no {Path(error.filename).name} there; give a folder of extrusion run"
             ) from None
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError("DIR", str(folder), f"not what extrusion run writes ({error!r}); run again") from None
+        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+            raise InputError("DIR", str(folder), f"its {reading} is not what extrusion run writes; run again") from None
         pressure = {t: (a[:, 0], a[:, 1]) for t, a in ((t, np.array(rows)) for t, rows in points.items())}
         return cls(case, t, u_y_K, reaction, pressure, snapshots)
 
 
-def _side_zone(case: Case) -> str:
-    """Name of the zone along the billet's side, or of the first."""
-    return next((zone.name for zone in case.zones if zone.billet == "side"), case.zones[0].name)
+def _pictured_zone(case: Case) -> Zone:
+    """The zone along the billet's side, or the first."""
+    return next((zone for zone in case.zones if zone.billet == "side"), case.zones[0])
 
 
 def write(record: Record, folder: str | Path) -> list[Path]:
@@ -144,6 +154,9 @@ def billet(record: Record) -> Figure:
     outline = np.array([vertex[1:] for vertex in profile.die])
     rim, top = outline.max(axis=0)
     bottom = min(0.0, outline[:, 1].min())
+    in_billet = np.unique(snapshots.triangles[snapshots.billet])
+    places = snapshots.points[in_billet] + snapshots.displacement[:, in_billet]
+    rim, top = max(rim, places[..., 0].max()), max(top, places[..., 1].max())
     n = len(order)
     height = 5.2
     width = height * 0.8 * 2 * rim / (top - bottom)
@@ -254,7 +267,8 @@ def _ticks(force: Array, linear: float) -> Array:
 def pressure(record: Record) -> Figure:
     """Contact pressure along the billet's side, normal to the die, at the pictured t; the die's vertices as lines.
 
-    In three dimensions the mean round the axis, with a band from the least to the most.
+    Along its front where no zone is on the side. In three dimensions the mean round the axis, with a band from the
+    least to the most.
     """
     profile = record.case.profile
     figure = _figure(record, 8, 4.2)
@@ -268,19 +282,21 @@ def pressure(record: Record) -> Figure:
             y, p, least, most = rings(y, p, RING * profile.radius)
             ax.fill_between(y, least, most, color=f"C{i}", alpha=0.25, linewidth=0)
         ax.plot(y, p, ".-", color=f"C{i}", markersize=4, linewidth=1, label=f"t = {t:g} mm")
-    for name in profile.bore:
-        y_vertex = profile.points[name][1]
-        ax.axvline(y_vertex, color="0.75", linewidth=0.8, zorder=0)
+    zone = _pictured_zone(record.case)
+    axis, component = ("y", 1) if zone.billet == "side" else ("r", 0)
+    for name in getattr(profile, zone.die):
+        vertex = profile.points[name][component]
+        ax.axvline(vertex, color="0.75", linewidth=0.8, zorder=0)
         ax.annotate(
             name,
-            (y_vertex, 1),
+            (vertex, 1),
             xycoords=("data", "axes fraction"),
             xytext=(0, 3),
             textcoords="offset points",
             ha="center",
             color="0.4",
         )
-    ax.set(xlabel="y [mm]", ylabel="contact pressure on the side [MPa]")
+    ax.set(xlabel=f"{axis} [mm]", ylabel=f"contact pressure on the {zone.billet} [MPa]")
     ax.grid(alpha=0.25, axis="y")
     if times:
         ax.legend(framealpha=1, edgecolor="none")  # over the die's lines

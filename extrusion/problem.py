@@ -56,6 +56,9 @@ log = logging.getLogger(__name__)
 SAFETY = 32.0
 """How far below the symmetric method's coercive gamma the unsymmetric one (theta = 0) may go."""
 
+STIFF_SLAVE = 5.0
+"""How many times stiffer than the billet a die is warned of as slave."""
+
 AXIS = {"r": 0, "y": 1}
 
 PLANES = {2: {"axis": 0, "die_axis": 0}, 3: {"billet_x": 0, "billet_z": 2, "die_x": 0, "die_z": 2}}
@@ -83,6 +86,14 @@ def _warn(case: Case) -> None:
     if case.die == "elastic" and case.die_material.E < case.billet.E and leads:
         other = " and the method nitsche" if case.method == "mortar" else ""
         log.warning('the die is softer than the billet: let it be slave (slave = "die")%s, or steps fail', other)
+    for zone in case.zones:
+        if case.method in ("penalty", "nitsche") and zone.slave == "die" and case.contrast(zone) >= STIFF_SLAVE:
+            log.warning(
+                "zone %s: a die %g times stiffer is slave: forces jump at edges, let the billet be slave "
+                '(slave = "billet")',
+                zone.name,
+                case.contrast(zone),
+            )
 
 
 class Problem(System):
@@ -111,7 +122,11 @@ class Problem(System):
         )
         self.Q = fem.functionspace(self.tagged.msh, ("Lagrange", 1)) if case.mixed else None
         self._materials = {"billet": case.billet, "die": case.die_material}
-        self._assemble_bulk()
+        try:
+            self._assemble_bulk()
+        except PermissionError as error:  # of DOLFINx, which keeps its compiled forms
+            remedy = "cannot be written: let XDG_CACHE_HOME name another folder"
+            raise InputError("cache_dir", str(error.filename), remedy) from None
         self._find_supports()
         if self.dim == 2:
             on_root(comm, ray)  # compiled there, if it has to be, before the other ranks look for it

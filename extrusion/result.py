@@ -77,7 +77,7 @@ class Comparison:
         return abs(self.difference) <= self.figure.tolerance
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Result:
     """A run: its accepted steps, in order, and what it took. The same on every rank, but for `snapshots`."""
 
@@ -90,7 +90,7 @@ class Result:
     error: str | None  # why the run stopped early
     solver: str  # surface, full or iterative
     seconds: dict[str, float]  # setup, solve, output; of solve: on the surface factor and condensation, and pairing
-    snapshots: Snapshots | None = field(repr=False, compare=False)  # rank 0; None without accepted steps
+    snapshots: Snapshots | None = field(repr=False)  # rank 0; None without accepted steps
     estimate: Estimate | None = None  # how far off it is, if the model was chosen for a tolerance
 
     @property
@@ -379,6 +379,8 @@ def run(
         if goal not in GOALS:
             raise InputError("goal", goal, f"choose one of {', '.join(GOALS)}")
     comm = MPI.COMM_WORLD if comm is None else comm
+    if mesh is not None and not isinstance(mesh, str | Path) and not hasattr(mesh, "cells"):
+        raise InputError("mesh", mesh, "give a mesh file, or what extrusion.mesh makes")
     given = str(mesh) if isinstance(mesh, str | Path) else None
     plain = None if isinstance(mesh, str | Path) else mesh
     case = changed(case, mesh=given, **changes)
@@ -536,15 +538,23 @@ def verify(case: Case, **options: Any) -> list[Result]:
     Raises:
         InputError: The case has no figures, or what `run` raises.
     """
+    refuse_unverifiable(case, **options)
+    asked = {figure.contact for figure in case.figures}
+    variants = {"solved": case, "check": case.with_contact("check")}
+    return [run(variant, **options) for contact, variant in variants.items() if contact in asked]
+
+
+def refuse_unverifiable(case: Case, **options: Any) -> None:
+    """Raise what `verify` would raise at once."""
     _refuse_other(case)
     if not case.figures:
         raise InputError("figures", [], f"case {case.name} has none to verify")
     times = changed(case, **{name: options.get(name) for name in ("increment", "until")}).times()
+    ends = {"side": ("L", "M"), "front": ("K", "L")}
     for figure in case.figures:
+        if figure.quantity == "gap" and not any(figure.point in ends[zone.billet] for zone in case.zones):
+            raise InputError("figures.point", figure.point, f"no zone of case {case.name} has it, so it has no gap")
         if not any(math.isclose(t, figure.t, rel_tol=1e-9) for t in times):
             raise InputError(
                 "figures.t", figure.t, f"no increment of case {case.name} ends there: add a row to its table"
             )
-    asked = {figure.contact for figure in case.figures}
-    variants = {"solved": case, "check": case.with_contact("check")}
-    return [run(variant, **options) for contact, variant in variants.items() if contact in asked]

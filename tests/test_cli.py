@@ -63,6 +63,7 @@ BROKEN = {
     "flat.msh": msh((2, 3)),
     "solid.msh": msh((5, 8)),
     "mesh.txt": "",
+    "bare.toml": cases.to_toml(replace(cases.A, figures=())),
     "slab.toml": cases.to_toml(replace(cases.A, space="plane strain")),
 }
 
@@ -107,6 +108,7 @@ BROKEN = {
         ("run A --bogus", "--bogus"),
         ("verify short.toml", "short.toml: increments"),
         ("verify A Z", "CASE = 'Z'"),
+        ("verify A bare.toml", "figures = []"),
         ("plot .", "no run.json there"),
         ("run A --mesh solid.msh", "--mesh = 'solid.msh': is a mesh in three dimensions"),
         ("run B --mesh flat.msh", "--mesh = 'flat.msh': has no cells in three dimensions"),

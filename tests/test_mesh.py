@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -362,3 +363,14 @@ def test_a_size_of_too_many_facets_is_refused() -> None:
     """A thousandth of a thin billet's radius is too many along it."""
     with pytest.raises(InputError, match=r"size = 0.01: give an element size between 0.013 and 1 mm"):
         graded_mesh(replace(SSNV504, radius=1.0), 0.01)
+
+
+def test_interrupted_meshing() -> None:
+    """Ctrl-C in gmsh's callback had been taken for any size: the mesh was another one, and the run went on."""
+    pytest.importorskip("gmsh")
+    timer = threading.Timer(0.3, signal.raise_signal, (signal.SIGINT,))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        graded_mesh(SSNV504, 0.2)
+    timer.join()
+    assert len(graded_mesh(SSNV504, 20.0).points) < 1000

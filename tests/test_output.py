@@ -280,3 +280,24 @@ def test_unwritable(tmp_path: Path) -> None:
     COMM.barrier()
     with pytest.raises(InputError, match="cannot be written"):
         run(CASE, out=blocked / "out", observers=[lambda problem, step: pytest.fail("solved")])
+
+
+def test_what_leaves_the_die_is_pictured(result: Result) -> None:
+    """The panel ended at the die's top, and was empty once the billet was past it."""
+    record = plots.Record.of(result)
+    assert record.snapshots is not None
+    moved = replace(record.snapshots, displacement=record.snapshots.displacement + np.array([0.0, 300.0]))
+    axes = plots.draw(replace(record, snapshots=moved), "billet").axes[0]
+    assert axes.get_ylim()[1] > 300
+
+
+@pytest.mark.parametrize("space", ["axisymmetric", "3d"])
+def test_pressure_on_the_front(space: str, tmp_path: Path) -> None:
+    """Without a zone on the side it stands over r; from the files as from the run."""
+    case = replace(cases.A, zones=cases.A.zones[1:], figures=(), method="penalty", order=1, size=12.0, space=space)
+    ran = run(case, out=tmp_path, increment=70.0, until=140.0, comm=MPI.COMM_SELF, pictures=False)
+    for record in (plots.Record.of(ran), plots.Record.read(tmp_path)):
+        axes = plots.draw(record, "pressure").axes[0]
+        assert (axes.get_xlabel(), axes.get_ylabel()) == ("r [mm]", "contact pressure on the front [MPa]")
+        (r, _), y_front = record.pressure[140.0], 205.0
+        assert 0 <= r.min() < r.max() < 55 < y_front

@@ -585,6 +585,26 @@ def test_a_die_softer_than_the_billet_is_slave(caplog: pytest.LogCaptureFixture)
     assert last.reaction == pytest.approx(-last.die_reaction, rel=1e-6)
 
 
+def test_a_die_stiffer_than_the_billet_is_no_slave(caplog: pytest.LogCaptureFixture) -> None:
+    """As published in D, H, I and J; nodal contact and mortar, whose stiffness is no force, are not warned of."""
+    mesh = case_mesh(A.profile)
+    for method, told in (("penalty", True), ("nodal", False)):
+        caplog.clear()
+        Problem(replace(H, method=method), mesh, MPI.COMM_SELF)
+        assert ("zone 2: a die 40 times stiffer is slave" in caplog.text) == told
+
+
+def test_a_cache_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """DOLFINx's forms are kept there."""
+
+    def denied(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", "/cache/fenics")
+
+    monkeypatch.setattr("dolfinx.fem.form", denied)
+    with pytest.raises(InputError, match=r"cache_dir = '/cache/fenics': .* XDG_CACHE_HOME"):
+        Problem(A, case_mesh(A.profile), MPI.COMM_SELF)
+
+
 def test_a_step_that_cannot_be_solved_says_where() -> None:
     """Time, zone, place and remedy; the steps before are kept."""
     problem = Problem(replace(A, **LAWS["nitsche 0"]), case_mesh(A.profile), MPI.COMM_SELF)

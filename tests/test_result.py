@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 import subprocess
 import sys
 from dataclasses import replace
@@ -19,7 +20,7 @@ from extrusion.errors import InputError
 from extrusion.mesh import PlainMesh, bundled, write_mesh
 from extrusion.mesh3d import hex_mesh
 from extrusion.problem import Problem
-from extrusion.result import Result, changed, verify
+from extrusion.result import Result, changed, refuse_unverifiable, verify
 from extrusion.stepping import Step
 
 SHORT = cases.A.with_increment(10, 30)
@@ -184,6 +185,7 @@ def test_ranks_do_not_matter() -> None:
         ({"zones": ("x",)}, "zones = 'x': give each as"),
         ({"order": 2, "form": "mixed", "billet": Elastic(5000, 0.0)}, "form = 'mixed': the pressure is divided by nu"),
         ({"until": 240.0, "increment": 60.0}, "increments = 240.0: end before the rear face leaves the die"),
+        ({"mesh": 3}, "mesh = 3: give a mesh file"),
     ],
 )
 def test_bad_options(options: dict[str, Any], told: str) -> None:
@@ -233,3 +235,17 @@ def test_what_another_method_or_space_leaves_behind() -> None:
     own = replace(slab, figures=cases.A.figures[:1])
     assert changed(own, space="plane strain").figures == own.figures
     assert changed(cases.A, space="3d").figures == cases.A.figures
+
+
+def test_a_result_is_equal_to_itself(result: Result) -> None:
+    """Its steps hold arrays, which have no one truth value."""
+    assert result == result
+    assert result != pickle.loads(pickle.dumps(replace(result, steps=[])))
+
+
+def test_a_gap_needs_a_zone_there() -> None:
+    """It was compared as nan."""
+    gap = cases.Figure(t=5.0, value=1.0, tolerance=0.1, point="K", quantity="gap", contact="check")
+    refuse_unverifiable(replace(cases.A, figures=(gap,)))
+    with pytest.raises(InputError, match=r"figures\.point = 'K': no zone of case A has it"):
+        verify(replace(cases.A, figures=(gap,), zones=cases.A.zones[:1]))
