@@ -33,6 +33,7 @@ import extrusion
 from extrusion.cases import CASES, METHODS, Case, read_toml
 from extrusion.contact import CLOSURES
 from extrusion.errors import InputError, StepError
+from extrusion.interrupt import interrupted_after
 
 if TYPE_CHECKING:
     from extrusion.estimate import Goal
@@ -583,9 +584,12 @@ def _start() -> None:
     """Load MPI and PETSc, and say so if there are more ranks on this machine than cores: MPICH busy-waits."""
     from extrusion.check import require_dolfinx
 
-    require_dolfinx()
-    from mpi4py import MPI
-    from petsc4py import PETSc
+    with interrupted_after():
+        require_dolfinx()
+        from mpi4py import MPI
+        from petsc4py import PETSc
+
+        from extrusion import condensed, output  # noqa: F401  and with them all that a run loads
 
     PETSc.Sys.popSignalHandler()  # which answers a closed pipe, or `kill`, with a page
     here, cores = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).size, os.cpu_count() or 1

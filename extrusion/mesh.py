@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import signal
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +26,7 @@ from dolfinx.graph import adjacencylist
 from dolfinx.io.utils import distribute_entity_data
 
 from extrusion.errors import InputError
+from extrusion.interrupt import interrupted_after
 from extrusion.profile import SSNV504, Array, Edge, Profile
 
 Indices = npt.NDArray[np.int64]
@@ -417,7 +416,7 @@ def _triangulate(
         gmsh.option.setNumber(f"Mesh.{option}", 0)
     gmsh.option.setNumber("Mesh.Algorithm", 6)  # frontal Delaunay
     try:
-        with _interrupted_after() as interrupted:
+        with interrupted_after() as interrupted:
             mesh.setSizeCallback(lambda dim, tag, x, y, z, lc: lc if interrupted else size(x, y))
             mesh.generate(2)
     except Exception as error:  # gmsh raises nothing narrower
@@ -439,22 +438,6 @@ def _triangulate(
     part = _Part(x.reshape(-1, 3)[:, :2].copy(), local(2, surface, 3), {k: np.vstack(f) for k, f in facets.items()})
     gmsh.model.remove()
     return part
-
-
-@contextmanager
-def _interrupted_after() -> Iterator[list[int]]:
-    """Ctrl-C takes effect at the end; until then it is listed. In a callback gmsh would take it for any size."""
-    before, heard = signal.getsignal(signal.SIGINT), list[int]()
-    listens = threading.current_thread() is threading.main_thread() and callable(before)
-    if listens:
-        signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
-    try:
-        yield heard
-    finally:
-        if listens:
-            signal.signal(signal.SIGINT, before)
-    if heard and callable(before):
-        before(signal.SIGINT, None)
 
 
 def read_mesh(path: str | Path, needed: Sequence[str] = ()) -> PlainMesh:
