@@ -271,6 +271,10 @@ class Case:
         of_billet = self.billet.E / self.die_material.E
         return max(1.0, of_billet if zone.slave == "billet" else 1 / of_billet)
 
+    def gamma_of(self, zone: Zone) -> float:
+        """A zone's contact stiffness by its softer body's modulus; that theta = 1 needs is by the slave's."""
+        return self.contact_gamma * (1.0 if self.theta == 1 else self.contrast(zone))
+
     def along_ray(self, zone: Zone) -> bool:
         """Whether a zone's gap is measured along its ray (else to the closest point)."""
         return (zone.gap or ("closest" if self.method == "nodal" else "ray")) == "ray"

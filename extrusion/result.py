@@ -345,7 +345,7 @@ def run(
         pictures: Draw them; else `extrusion plot` draws them from the files.
         solver: "surface" (the bulk factored once, Newton's method on the forces of contact), "full" (on all unknowns),
             "iterative" (these by multigrid, in 3D), or "auto": the one that is estimated to be cheapest. All give the
-            same answer.
+            same answer, where there is but one.
         tolerance: Relative error of the goal for which the cheapest model is chosen (die, order, size, zones), in place
             of the case's own; the result has the `Estimate`.
         goal: "K" (its u_y) or "reaction".

@@ -48,7 +48,7 @@ DAMP = 8
 """Passes after which billet and die are paired halfway between the last two solutions."""
 
 SOFT = 10.0
-"""Contact stiffness gamma, by the softer body's modulus, that is solved with at once; to more it is led (`_led`)."""
+"""Contact stiffness (`Case.gamma_of`) that an increment is solved with at once; it is led to a larger one (`_led`)."""
 
 STIFFEN = 10.0
 """Ratio of the contact stiffness between two solves that lead to a large one."""
@@ -279,8 +279,8 @@ def _led(problem: System, newton: Newton, ahead: float) -> Outcome:
     x, case = problem.x, problem.case
     if case.method not in ("penalty", "nitsche"):
         return newton.solve(x, ahead=ahead)
-    soft = SOFT * STIFFEN if case.theta == 1 else SOFT  # which is not coercive below 27 to 36, by the slave's modulus
-    stiffest = case.contact_gamma * (1.0 if case.theta == 1 else max(case.contrast(zone) for zone in case.zones))
+    soft = SOFT * STIFFEN if case.theta == 1 else SOFT  # which is not coercive below 27 to 36
+    stiffest = max(case.gamma_of(zone) for zone in case.zones)
     iterations, at, ratio = 0, 0.0, STIFFEN
 
     def following(at: float, end: float) -> float:

@@ -205,11 +205,9 @@ class System(ABC):
             term.hold(z)
 
     def soften(self, gamma: float | None) -> None:
-        """Take at most this contact stiffness, by the softer body's modulus, from now on; None: what the case says."""
-        case = self.case
-        for term, zone in zip(self.terms, case.zones, strict=True):
-            own = case.contact_gamma * case.contrast(zone)
-            term.soften(1.0 if gamma is None else min(1.0, gamma / own))
+        """Take at most this contact stiffness (`Case.gamma_of`) from now on; None: what the case says."""
+        for term, zone in zip(self.terms, self.case.zones, strict=True):
+            term.soften(1.0 if gamma is None else min(1.0, gamma / self.case.gamma_of(zone)))
 
     def expect(self, ahead: float | None) -> bool:
         """Take the contact set that is expected as given (`ContactTerm.expect`); say if any zone has one."""

@@ -418,6 +418,7 @@ def test_a_stiff_slave_is_led_to(law: str) -> None:
     zones = (replace(A.zones[0], slave="die"),)
     case = replace(A, **LAWS[law], order=2, size=3.0, zones=zones, billet=Elastic(5000.0, 0.3))
     assert [case.contrast(zone) for zone in (*zones, *A.zones)] == [40.0, 1.0, 1.0]
+    assert replace(case, theta=1, gamma=40.0, method="nitsche").gamma_of(*zones) == 40.0
     system = Condensed(Problem(case, case_mesh(A.profile, 3.0), MPI.COMM_SELF))
     run = list(steps(system, Newton(system), list(np.arange(5.0, 41.0, 5.0))))
     assert sum(step.cuts for step in run) == 0
