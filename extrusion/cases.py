@@ -292,10 +292,10 @@ class Case:
         """The same case with a uniform increment and another end, mm."""
         end = self.end if until is None else _number("until", until, 0.0, "give a positive t in mm")
         if increment is not None:
-            return replace(
-                self,
-                increments=((_number("increment", increment, 0.0, "give a positive length in mm"), end),),
-            )
+            step = _number("increment", increment, 0.0, "give a positive length in mm")
+            if end / step > MOST_STEPS:
+                raise InputError("increment", step, f"give a longer one: at most {MOST_STEPS} of them")
+            return replace(self, increments=((step, end),))
         if end > self.end:
             raise InputError("until", end, f"the case's table ends at {self.end:g} mm: give an increment too")
         rows = [row for row in self.increments if row[1] < end]
