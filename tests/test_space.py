@@ -319,11 +319,11 @@ def test_divided_facets(
     images = [y.duplicate() for _ in systems]
     for system, image in zip(systems, images, strict=True):
         system.residual(x, image)
-    assert_allclose(images[0].array_r, images[1].array_r, rtol=0, atol=1e-12 * images[1].norm())
+    assert_allclose(images[0].array_r, images[1].array_r, rtol=0, atol=1e-9 * images[1].norm())
     for system, image in zip(systems, images, strict=True):
         system.tangent(x, True).mult(y, image)
     images[0].axpy(-1.0, images[1])
-    assert images[0].norm() < 1e-12 * images[1].norm()
+    assert images[0].norm() < 1e-9 * images[1].norm()
     sides = [system.terms[0] for system in systems]
     assert all(isinstance(side, IntegratedContact) for side in sides)
     if comm.size > 1:
