@@ -1,13 +1,14 @@
 """What a simpler model costs, estimated before it is taken."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 
-from extrusion import cases, run
+from extrusion import cases, estimate, run
 from extrusion.condensed import Condensed
 from extrusion.errors import InputError
 from extrusion.estimate import Error, Track, checks, choose_model, continuous, solve
@@ -115,3 +116,13 @@ def test_estimates_hold() -> None:
     """An estimate more than twice too small, or ten times too large."""
     for check in checks(SELF):
         assert check.ok, check
+
+
+@pytest.mark.parametrize(("end", "kept"), [(150.0, 1), (210.0, 2)])
+def test_a_zone_beyond_the_end_of_the_die_is_kept(monkeypatch: pytest.MonkeyPatch, end: float, kept: int) -> None:
+    """With it the side that passes the bore's end (y = 205) is held, without it it is let go: that is another scene."""
+    zones = {"1": SimpleNamespace(x=np.array([[48.0, end]])), "2": SimpleNamespace(gap=np.array([30.0]))}
+    monkeypatch.setattr(estimate, "solve", lambda *_: ([SimpleNamespace(zones=zones)], []))
+    scene, parts = estimate._without_open_zones(cases.A, 8.0, MPI.COMM_SELF)
+    assert len(scene.zones) == kept
+    assert len(parts) == 2 - kept
