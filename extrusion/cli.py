@@ -192,7 +192,7 @@ def run(
         console.print(f"Files are in {out}", soft_wrap=True, highlight=False)
     if not result.converged:
         _say(f"{result.error} (accepted steps are kept in {out})")
-        raise typer.Exit(INTERRUPTED if interrupt.stopped else 1)
+        sys.exit(INTERRUPTED if interrupt.stopped else 1)
 
 
 @app.command()
@@ -290,7 +290,7 @@ def study(
         which = f"{cell.problem} {cell.die} {cell.method} P{cell.order} nu {cell.nu:g} {cell.increment:g} mm"
         print(f"{number} of {of}: {which}: {outcome.status} {outcome.note}", file=sys.stderr)
 
-    with _writing("--out"):
+    with _writing("--out", out):
         rows = hard_cases.run(path, tell)
     table = Table(box=SIMPLE_HEAD, padding=0)
     for column in ("part, method", "cells", "converged", "excluded", "failed"):
@@ -298,7 +298,7 @@ def study(
     for row in hard_cases.summary(rows):
         table.add_row(*map(str, row))
     Console().print(table)
-    with _writing("--out"):
+    with _writing("--out", out):
         hard_cases.draw(rows, path.with_suffix(".png"))
 
 
@@ -349,7 +349,7 @@ def bench(
         told = outcome.note or f"{outcome.wall:.2f} s, {outcome.iterations} iterations"
         _say(f"{number} of {of}: {cell}: {outcome.status}, {told}")
 
-    with _as_options({"out"}), _writing("--out"):
+    with _as_options({"out"}), _writing("--out", out):
         here, runs = speed.run(out, quick=quick, progress=tell)
         print(speed.write(out, here, runs))
 
@@ -415,6 +415,8 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
     try:
         command = typer.main.get_command(app)
         status = command.main(None if args is None else [*args], prog_name="extrusion", standalone_mode=False)
+        if status == INTERRUPTED:  # typer's own, of a KeyboardInterrupt
+            _say("interrupted")
         sys.exit(status if isinstance(status, int) else 0)
     except InputError as error:
         _say(str(error))
@@ -557,14 +559,12 @@ def _check_writable(field: str, path: Path) -> None:
 
 
 @contextmanager
-def _writing(field: str) -> Iterator[None]:
-    """A file that cannot be written after all is told as the field's."""
+def _writing(field: str, folder: Path) -> Iterator[None]:
+    """A folder in which a file cannot be written after all is told as the field's."""
     try:
         yield
     except OSError as error:
-        if error.filename is None:
-            raise
-        raise InputError(field, str(error.filename), f"cannot be written ({error.strerror})") from None
+        raise InputError(field, str(error.filename or folder), f"cannot be written ({error.strerror})") from None
 
 
 def _write_json(result: Result, path: Path | None) -> None:

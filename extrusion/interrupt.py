@@ -23,5 +23,5 @@ def interrupted_after() -> Iterator[list[int]]:
     finally:
         if listens:
             signal.signal(signal.SIGINT, before)
-    if heard and callable(before):
-        before(signal.SIGINT, None)
+        if heard and callable(before):
+            before(signal.SIGINT, None)

@@ -159,7 +159,7 @@ class Newton:
             ahead: The increment over the last one; None: the contact set is that of x.
             share: End at this part of the first residual.
         """
-        self._limit, self._share = self._max if at_most is None else at_most, share
+        self._limit, self._share = self._max if at_most is None else min(at_most, self._max), share
         self.history, self._update, self._fresh, self._watched = [], np.inf, False, 0
         self.problem.hold(None)
         self.tolerance = max(self.atol, self.problem.round_off(x))

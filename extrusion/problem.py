@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
@@ -23,6 +24,7 @@ import basix.ufl
 import dolfinx.fem.petsc
 import ufl
 from dolfinx import fem
+from dolfinx.jit import get_options
 
 from extrusion.cases import GAMMA, LOCKING_FROM, MIXED_ABOVE, Case, Zone
 from extrusion.compiled import ray
@@ -96,6 +98,16 @@ def _warn(case: Case) -> None:
             )
 
 
+def _make_cache() -> None:
+    """The folder in which DOLFINx keeps its compiled forms."""
+    folder = Path(get_options()["cache_dir"])
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        remedy = f"cannot be made ({error.strerror}): let XDG_CACHE_HOME name another folder"
+        raise InputError("cache_dir", str(folder), remedy) from None
+
+
 class Problem(System):
     """One scene, discretised; x holds all displacements (and pressures and multipliers), each rank its own.
 
@@ -122,11 +134,8 @@ class Problem(System):
         )
         self.Q = fem.functionspace(self.tagged.msh, ("Lagrange", 1)) if case.mixed else None
         self._materials = {"billet": case.billet, "die": case.die_material}
-        try:
-            self._assemble_bulk()
-        except PermissionError as error:  # of DOLFINx, which keeps its compiled forms
-            remedy = "cannot be written: let XDG_CACHE_HOME name another folder"
-            raise InputError("cache_dir", str(error.filename), remedy) from None
+        on_root(comm, _make_cache)
+        self._assemble_bulk()
         self._find_supports()
         if self.dim == 2:
             on_root(comm, ray)  # compiled there, if it has to be, before the other ranks look for it

@@ -296,7 +296,8 @@ def _led(problem: System, newton: Newton, ahead: float) -> Outcome:
         outcome = newton.solve(x, ahead=ahead)
         if outcome.converged:
             return outcome
-        iterations += outcome.iterations
+        iterations, direct, failed = outcome.iterations, outcome, x.duplicate()
+        x.copy(failed)
         predicted.copy(x)
     try:
         while True:
@@ -313,7 +314,10 @@ def _led(problem: System, newton: Newton, ahead: float) -> Outcome:
             while at and ratio > LEAST and following(at, stiffest) >= goal:
                 ratio **= 0.5
             if not at or following(at, stiffest) >= goal:
-                if not at_once:
+                if at_once:
+                    outcome = direct
+                    failed.copy(x)
+                else:
                     predicted.copy(x)
                     problem.soften(None)
                     outcome = newton.solve(x, ahead=ahead)

@@ -243,6 +243,17 @@ def test_interrupted_before_the_first_step(monkeypatch: pytest.MonkeyPatch, caps
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def test_interrupted_anywhere(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    """Where no step is watched it is one line, too."""
+
+    def press(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("extrusion.cli._load", press)
+    assert command("mesh", "A") == 130
+    assert capsys.readouterr().err == "extrusion: interrupted\n"
+
+
 def test_out_of_memory(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     """PETSc's own words are a page."""
 

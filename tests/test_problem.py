@@ -4,6 +4,7 @@ import gc
 import weakref
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
@@ -476,8 +477,8 @@ class Stiff(Newton):
         stiffness = self.problem.case.contact_gamma * float(term._k[0] / term._stiffness[0])
         self.asked.append((round(stiffness, 1), round(float(x.array_r[1]), 1), ahead is None, share > 0))
         good = self.answers.pop(0)
-        x.array[1] = stiffness if good else -1.0
-        return Outcome(good, 2, 0.0, "")
+        x.array[1] = stiffness if good else -float(len(self.asked))
+        return Outcome(good, 2, 0.0, f"solve {len(self.asked)}")
 
 
 @pytest.mark.parametrize(
@@ -515,6 +516,30 @@ def test_how_a_stiff_contact_is_led_to(
     assert newton.asked == asked
     assert len(set(newton.asked)) == len(newton.asked)
     assert (outcome.converged, outcome.iterations) == (answers[-1], 2 * len(answers))
+    assert np.all(system.terms[0]._k == system.terms[0]._stiffness)
+
+
+@pytest.mark.parametrize(
+    ("answers", "ends"),
+    [  # which solve is told of, and what x is left with
+        ([True], (True, "solve 1", 10)),
+        ([False, True, True, True], (True, "solve 4", 10)),
+        ([False, False], (False, "solve 1", -1)),
+        ([False, True, *[False] * 4], (False, "solve 1", -1)),
+    ],
+)
+def test_a_stiff_slave_is_led_to_where_it_fails(answers: list[bool], ends: tuple[bool, str, float]) -> None:
+    """At first at once, and what is told of a failure is that of this solve."""
+    zones = (replace(A.zones[0], slave="die"),)
+    case = replace(A, order=1, method="penalty", zones=zones)
+    system = Condensed(Problem(case, case_mesh(A.profile), MPI.COMM_SELF))
+    newton = Stiff(system, [*answers])
+    system.x.array[1] = 1.0
+    outcome = _led(system, newton, 1.0)
+    assert (outcome.converged, outcome.reason, round(float(system.x.array_r[1]), 6)) == ends
+    assert (len(newton.answers), outcome.iterations) == (0, 2 * len(answers))
+    assert newton.asked[0] == (10.0, 1.0, False, False)
+    assert newton.asked[1:2] in ([], [(0.2, 1.0, False, True)])  # gamma = 10 by the billet's modulus
     assert np.all(system.terms[0]._k == system.terms[0]._stiffness)
 
 
@@ -597,14 +622,11 @@ def test_a_die_stiffer_than_the_billet_is_no_slave(caplog: pytest.LogCaptureFixt
         assert ("zone 2: a die 40 times stiffer is slave" in caplog.text) == told
 
 
-def test_a_cache_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cache_that_cannot_be_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """DOLFINx's forms are kept there."""
-
-    def denied(*_: object, **__: object) -> None:
-        raise PermissionError(13, "Permission denied", "/cache/fenics")
-
-    monkeypatch.setattr("dolfinx.fem.form", denied)
-    with pytest.raises(InputError, match=r"cache_dir = '/cache/fenics': .* XDG_CACHE_HOME"):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("extrusion.problem.get_options", lambda: {"cache_dir": str(tmp_path / "file" / "fenics")})
+    with pytest.raises(InputError, match=r"cache_dir = '.*fenics': .* XDG_CACHE_HOME"):
         Problem(A, case_mesh(A.profile), MPI.COMM_SELF)
 
 
