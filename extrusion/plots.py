@@ -47,10 +47,8 @@ class Record:
         for step in result.steps:
             if zone.name in step.zones:
                 state = step.zones[zone.name]
-                place = (
-                    state.x[:, 1] if zone.billet == "side" else np.linalg.norm(np.delete(state.x, 1, axis=1), axis=1)
-                )
-                pressure[step.t] = place, state.pressure
+                y, r = state.x[:, 1], np.linalg.norm(np.delete(state.x, 1, axis=1), axis=1)
+                pressure[step.t] = y if zone.billet == "side" else r, state.pressure
         return cls(result.case, result.t, result.point("K")[:, 1], result.reaction, pressure, result.snapshots)
 
     @classmethod

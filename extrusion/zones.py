@@ -31,7 +31,10 @@ class ContactTerm(Protocol):
     multipliers: int
     forced: Index  # displacements (and pressures) in z that the term can put a force on, in order along slave and die
     caught: float  # mm: how far from the die the farthest point was that the last `start` or `accept` closed for good
-    divided: bool  # whether each rank evaluates a part of the slave's facets
+
+    @property
+    def divided(self) -> bool:
+        """Whether each rank evaluates a part of the slave's facets."""
 
     def divide(self, comm: MPI.Intracomm) -> bool:
         """From now on add to residual and tangent what this rank's part of the slave's facets does, and say if so.
@@ -435,12 +438,15 @@ class IntegratedContact:
             mine = self.pair.part(np.arange(comm.rank, len(self.closed), comm.size))  # what is closed is in one place
         self._comm, self._mine = (MPI.COMM_SELF, self.pair) if mine is None else (comm, mine)
         self._points = _Latest(self._find)
-        self.divided = mine is not None
         return self.divided
+
+    @property
+    def divided(self) -> bool:
+        return self._comm.size > 1
 
     def _of_all(self, facet: Index, *rows: np.ndarray) -> tuple[np.ndarray, ...]:
         """Rows that belong to facets, of all ranks and in the facets' order."""
-        if self._comm.size == 1:
+        if not self.divided:
             return rows
         facet, *rows_ = (np.concatenate(part) for part in zip(*self._comm.allgather((facet, *rows)), strict=True))
         order = np.argsort(facet, kind="stable")
@@ -478,7 +484,7 @@ class IntegratedContact:
 
     def _catch(self, points: Points, new: np.ndarray) -> None:
         self.caught = _farthest(points.gap, new[points.facet])
-        if self._comm.size > 1:
+        if self.divided:
             self.caught = self._comm.allreduce(self.caught, op=MPI.MAX)
 
     def stiffness_norm(self) -> float:
@@ -503,7 +509,7 @@ class IntegratedContact:
             found = self._mine.points(z, self._order, self.pair.closure != "check", self._material, self._held)
         except ArithmeticError as error:
             lost = str(error)
-        if self._comm.size > 1:
+        if self.divided:
             told = [message for one, message in self._comm.allgather((found is None, lost)) if one]
             found, lost = (None, told[0]) if told else (found, "")
         if found is None:

@@ -97,6 +97,7 @@ BROKEN = {
         ("run A --increment 0", "--increment = 0.0"),
         ("run A --until 0", "--until = 0.0"),
         ("run A --until 156", "--until = 156.0"),
+        ("run A --until 500 --increment 50", "increments = 500.0: end before the rear face leaves the die"),
         ("run A --increment 1e-6", "--increment = 1e-06: give a longer one: at most 100000"),
         ("run A --theta 1", "--theta = 1: leave it out: it is a variant of method = 'nitsche'"),
         ("verify between.toml", "figures.t = 7.0: no increment of case A ends there"),
