@@ -272,7 +272,7 @@ class Case:
         return max(1.0, of_billet if zone.slave == "billet" else 1 / of_billet)
 
     def gamma_of(self, zone: Zone) -> float:
-        """A zone's contact stiffness by its softer body's modulus; by the slave's for theta = 1, which needs as much."""
+        """A zone's contact stiffness by its softer body's modulus (theta = 1, which needs as much: by the slave's)."""
         return self.contact_gamma * (1.0 if self.theta == 1 else self.contrast(zone))
 
     def along_ray(self, zone: Zone) -> bool:

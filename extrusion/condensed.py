@@ -389,9 +389,8 @@ class Condensed(System):
     def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         try:
             values = self._out_of_balance(x, self._evaluated(x))
-        except ArithmeticError:
-            f.set(np.nan)
-            return
+        except ArithmeticError:  # on rank 0 alone, unless the terms are divided
+            values = np.full(max(f.local_size - 1, 0), np.nan)
         out = f.array  # on every rank: PETSc counts changes, and forgets the norm
         out[1:] = values
         out[:1] = 0.0

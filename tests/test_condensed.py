@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import replace
+from typing import Any
 
 from mpi4py import MPI
 
@@ -85,6 +86,26 @@ def test_all_unknowns_on_two_ranks() -> None:
         found.append(step.zones["1"])
     np.testing.assert_allclose(found[0].pressure, found[1].pressure, rtol=0, atol=1e-6)
     assert found[1].closed.any()
+
+
+@pytest.mark.mpi
+def test_a_lost_surface_on_two_ranks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rank 0 alone knows of it: had it a norm at hand that the other asks for, they would wait for each other."""
+    comm = MPI.COMM_WORLD
+    system = Condensed(scene(UNILATERAL, comm))
+    f = system.x.duplicate()
+    system.start(system.x)
+    whole = system._out_of_balance
+
+    def lost(*of: Any) -> Any:
+        if comm.rank == 0:
+            raise ArithmeticError("a ray does not meet the die")
+        return whole(*of)
+
+    for evaluate, ends in ((whole, True), (lost, False), (whole, True)):
+        monkeypatch.setattr(system, "_out_of_balance", evaluate)
+        system.residual(system.x, f)
+        assert comm.allgather(bool(np.isfinite(f.norm()))) == comm.size * [ends]
 
 
 def test_only_what_is_reached_is_solved_for() -> None:
