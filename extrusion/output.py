@@ -6,7 +6,6 @@ after each step, so a run that fails, or is stopped, leaves its accepted steps b
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import logging
 import time
@@ -27,6 +26,7 @@ from extrusion.cases import Case, to_toml
 from extrusion.errors import InputError
 from extrusion.mesh import on_root
 from extrusion.mesh3d import FACES
+from extrusion.painter import Painter, available
 from extrusion.problem import Problem
 from extrusion.result import Array, Observer, Result, Snapshots
 from extrusion.stepping import Step
@@ -59,14 +59,14 @@ class Folder:
     Args:
         path: Where; parents are made too.
         comm: The ranks of the run.
-        pictures: Draw them, which takes as long as a small run.
+        painter: What draws pictures, on rank 0; without it none are drawn.
 
     Raises:
         InputError: On every rank, if the folder cannot be written.
     """
 
-    def __init__(self, path: str | Path, comm: MPI.Intracomm, pictures: bool = True) -> None:
-        self.path, self._comm, self._pictures = Path(path), comm, pictures
+    def __init__(self, path: str | Path, comm: MPI.Intracomm, painter: Painter | None = None) -> None:
+        self.path, self._comm, self._painter = Path(path), comm, painter
         self.observers: list[Observer] = [History(path), Contact(path), Fields(path)]
 
         def make() -> None:
@@ -84,12 +84,12 @@ class Folder:
         def draw() -> None:
             if result.snapshots is not None:
                 np.savez_compressed(self.path / "snapshots.npz", **vars(result.snapshots))
-            if not self._pictures:
+            if self._painter is None:
                 return
-            if importlib.util.find_spec("matplotlib") is None:
+            if not available():
                 log.warning('pictures skipped: matplotlib is not installed (pip install "extrusion[plot]")')
             elif result.steps:
-                plots.write(plots.Record.of(result), self.path)
+                self._painter.write(plots.Record.of(result), self.path)
 
         def write() -> None:
             text = json.dumps(run_record(result, options), indent=1, allow_nan=False)

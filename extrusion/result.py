@@ -367,6 +367,7 @@ def run(
     from extrusion import output
     from extrusion.condensed import SOLVERS, choose
     from extrusion.newton import Newton
+    from extrusion.painter import Painter
     from extrusion.problem import Problem
     from extrusion.stepping import steps
 
@@ -408,10 +409,11 @@ def run(
             from extrusion.estimate import choose_model
 
             case, estimate = choose_model(case, tolerance, goal, comm)
+    painter = Painter(comm.size) if out is not None and pictures and comm.rank == 0 else None
     problem = Problem(case, _mesh(comm, case, plain), comm)
     seconds = {"setup": time.perf_counter() - start, "solve": 0.0, "output": 0.0}
     camera = output.Camera(case, PICTURED)
-    folder = None if out is None else output.Folder(out, comm, pictures)
+    folder = None if out is None else output.Folder(out, comm, painter)
     watching = [camera, *(() if folder is None else folder.observers), *observers]
     began = time.perf_counter()
     system = choose(problem, solver)

@@ -2,6 +2,9 @@
 
 import csv
 import json
+import signal
+import subprocess
+import sys
 import tomllib
 from dataclasses import replace
 from functools import partial
@@ -15,6 +18,7 @@ import pytest
 from extrusion import cases, plots, run
 from extrusion.errors import InputError
 from extrusion.newton import Newton
+from extrusion.painter import Painter
 from extrusion.result import Result, Snapshots, element_name
 
 COMM = MPI.COMM_WORLD
@@ -206,6 +210,40 @@ def test_pictures(result: Result, folder: Path) -> None:
     assert [(folder / f"{kind}.png").read_bytes() for kind in plots.KINDS] == before
     with pytest.raises(InputError, match="choose one of billet, history, pressure"):
         result.plot("billets")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("executable", [sys.executable, "/bin/false", "/nowhere"])
+def test_painter(
+    result: Result, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executable: str
+) -> None:
+    """Another process draws the same pictures; where it fails, or cannot begin, they are drawn here."""
+    pytest.importorskip("matplotlib")
+    record, here = plots.Record.of(result), []
+    draw = plots.write
+    with monkeypatch.context() as patch:
+        patch.delitem(sys.modules, "matplotlib")
+        patch.setattr("os.cpu_count", lambda: 2)
+        patch.setattr("sys.executable", executable)
+        painter = Painter(1)
+    monkeypatch.setattr(plots, "write", lambda *args: here.append(args) or draw(*args))
+    painter.write(record, tmp_path)
+    assert bool(here) is (executable != sys.executable)
+    for kind in plots.KINDS:
+        assert (tmp_path / f"{kind}.png").read_bytes() == (folder / f"{kind}.png").read_bytes()
+
+
+def test_painter_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No process is begun where there is no core for it, and none outlives a run that comes to nothing."""
+    pytest.importorskip("matplotlib")
+    monkeypatch.delitem(sys.modules, "matplotlib")
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    begun = []
+    popen = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", lambda *args, **kw: begun.append(popen(*args, **kw)) or begun[-1])
+    Painter(2)
+    assert not begun
+    Painter(1)  # and goes
+    assert [process.returncode for process in begun] == [-signal.SIGKILL]
 
 
 @pytest.mark.parametrize(
