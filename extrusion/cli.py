@@ -12,18 +12,16 @@ import importlib.util
 import json
 import logging
 import os
-import re
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
-import typer
+import click
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -41,34 +39,16 @@ if TYPE_CHECKING:
     from extrusion.result import Observer, Result
     from extrusion.stepping import Step
 
-app = typer.Typer(
-    name="extrusion",
-    help="An elastic billet pushed through a die: large-sliding contact on FEniCSx.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
-CaseName = Annotated[str, typer.Argument(metavar="CASE|FILE.toml", help="A case of `extrusion list`, or a file.")]
+PATH = click.Path(path_type=Path)
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
-        print(extrusion.__version__)
-        raise typer.Exit
-
-
-@app.callback()
-def _root(
-    version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Print the version.")
-    ] = False,
-) -> None:
-    pass
+@click.group(context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=True)
+@click.version_option(extrusion.__version__, message="%(version)s", help="Print the version.")
+def app() -> None:
+    """An elastic billet pushed through a die: large-sliding contact on FEniCSx."""
 
 
 @app.command("list")
@@ -84,68 +64,69 @@ def list_cases() -> None:
 
 
 @app.command()
+@click.argument("case", metavar="CASE|FILE.toml")
+@click.option("--method", metavar="|".join(METHODS), help="How contact is written.")
+@click.option("--order", type=int, metavar="1|2", help="Order of the displacements.")
+@click.option("--die", metavar="elastic|rigid")
+@click.option("--contact", metavar="|".join(CLOSURES), help="Contact in every zone; check only reports it.")
+@click.option("--size", type=float, metavar="MM", help="Element size on the billet's side of a graded mesh.")
+@click.option("--mesh", type=PATH, metavar="FILE", help="Mesh (.msh, .med) in place of the case's.")
+@click.option(
+    "--space", metavar="axisymmetric|3d|plane strain", help="The half-plane, a quarter in three dimensions, or a slab."
+)
+@click.option("--sectors", type=int, metavar="N", help="In 3d: elements over the quarter turn.")
+@click.option("--element", metavar="lagrange|serendipity", help="In 3d with order 2: 27 or 20 nodes a hexahedron.")
+@click.option("--increment", type=float, metavar="MM", help="Uniform increment, in place of the case's table.")
+@click.option("--until", type=float, metavar="MM", help="Last t; by default the case's.")
+@click.option("--form", metavar="displacement|mixed", help="The billet's bulk; by default mixed above nu 0.49.")
+@click.option("--gamma", type=float, help="Dimensionless contact stiffness.")
+@click.option("--theta", type=int, metavar="-1|0|1", help="Variant of Nitsche's method.")
+@click.option(
+    "--solver",
+    default="auto",
+    show_default=True,
+    metavar="auto|surface|full|iterative",
+    help="Newton's method on contact's forces, or on all unknowns; iterative: these by multigrid, in 3d.",
+)
+@click.option(
+    "--tolerance", type=float, metavar="X", help="Relative error of the goal, for which the cheapest model is chosen."
+)
+@click.option("--goal", metavar="K|reaction", help="What the tolerance is of; by default K.")
+@click.option("--adapt", is_flag=True, help="Refine a mesh where the goal needs it, until it has the tolerance.")
+@click.option("--out", type=PATH, metavar="DIR", help="Folder for files; by default results/CASE.")
+@click.option(
+    "--pictures/--no-pictures", default=True, help="Draw pictures; else `extrusion plot` does, from the files."
+)
+@click.option(
+    "--json", "json_file", type=PATH, metavar="FILE", help="Write the result as one JSON object; - is stdout."
+)
+@click.option("--quiet", is_flag=True, help="Print errors only.")
 def run(
-    case: CaseName,
-    method: Annotated[str | None, typer.Option(metavar="|".join(METHODS), help="How contact is written.")] = None,
-    order: Annotated[int | None, typer.Option(metavar="1|2", help="Order of the displacements.")] = None,
-    die: Annotated[str | None, typer.Option(metavar="elastic|rigid")] = None,
-    contact: Annotated[
-        str | None,
-        typer.Option(metavar="|".join(CLOSURES), help="Contact in every zone; check only reports it."),
-    ] = None,
-    size: Annotated[
-        float | None, typer.Option(metavar="MM", help="Element size on the billet's side of a graded mesh.")
-    ] = None,
-    mesh: Annotated[Path | None, typer.Option(metavar="FILE", help="Mesh (.msh, .med) in place of the case's.")] = None,
-    space: Annotated[
-        str | None,
-        typer.Option(
-            metavar="axisymmetric|3d|plane strain", help="The half-plane, a quarter in three dimensions, or a slab."
-        ),
-    ] = None,
-    sectors: Annotated[int | None, typer.Option(metavar="N", help="In 3d: elements over the quarter turn.")] = None,
-    element: Annotated[
-        str | None,
-        typer.Option(metavar="lagrange|serendipity", help="In 3d with order 2: 27 or 20 nodes a hexahedron."),
-    ] = None,
-    increment: Annotated[
-        float | None, typer.Option(metavar="MM", help="Uniform increment, in place of the case's table.")
-    ] = None,
-    until: Annotated[float | None, typer.Option(metavar="MM", help="Last t; by default the case's.")] = None,
-    form: Annotated[
-        str | None,
-        typer.Option(metavar="displacement|mixed", help="The billet's bulk; by default mixed above nu 0.49."),
-    ] = None,
-    gamma: Annotated[float | None, typer.Option(help="Dimensionless contact stiffness.")] = None,
-    theta: Annotated[int | None, typer.Option(metavar="-1|0|1", help="Variant of Nitsche's method.")] = None,
-    solver: Annotated[
-        str,
-        typer.Option(
-            metavar="auto|surface|full|iterative",
-            help="Newton's method on contact's forces, or on all unknowns; iterative: these by multigrid, in 3d.",
-        ),
-    ] = "auto",
-    tolerance: Annotated[
-        float | None,
-        typer.Option(metavar="X", help="Relative error of the goal, for which the cheapest model is chosen."),
-    ] = None,
-    goal: Annotated[
-        str | None, typer.Option(metavar="K|reaction", help="What the tolerance is of; by default K.")
-    ] = None,
-    adapt: Annotated[
-        bool, typer.Option("--adapt", help="Refine a mesh where the goal needs it, until it has the tolerance.")
-    ] = False,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for files; by default results/CASE.")] = None,
-    pictures: Annotated[
-        bool,
-        typer.Option("--pictures/--no-pictures", help="Draw pictures; else `extrusion plot` does, from the files."),
-    ] = True,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the result as one JSON object; - is stdout.")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
+    case: str,
+    method: str | None,
+    order: int | None,
+    die: str | None,
+    contact: str | None,
+    size: float | None,
+    mesh: Path | None,
+    space: str | None,
+    sectors: int | None,
+    element: str | None,
+    increment: float | None,
+    until: float | None,
+    form: str | None,
+    gamma: float | None,
+    theta: int | None,
+    solver: str,
+    tolerance: float | None,
+    goal: str | None,
+    adapt: bool,
+    out: Path | None,
+    pictures: bool,
+    json_file: Path | None,
+    quiet: bool,
 ) -> None:
-    """Run a case; write tables, fields and pictures."""
+    """Run a case of `extrusion list`, or of a file; write tables, fields and pictures."""
     changes = dict(
         method=method, order=order, die=die, contact=contact, size=size, mesh=mesh, space=space, sectors=sectors,
         element=element, increment=increment, until=until, form=form, gamma=gamma, theta=theta,
@@ -196,16 +177,11 @@ def run(
 
 
 @app.command()
-def verify(
-    cases: Annotated[
-        list[str] | None, typer.Argument(metavar="[CASE|FILE.toml]...", help="By default all of `extrusion list`.")
-    ] = None,
-    estimates: Annotated[
-        bool, typer.Option("--estimates", help="Compare estimated errors with actual ones instead (a minute).")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
-) -> None:
-    """Run cases as the sheet states them, and compare with its figures."""
+@click.argument("cases", metavar="[CASE|FILE.toml]...", nargs=-1)
+@click.option("--estimates", is_flag=True, help="Compare estimated errors with actual ones instead (a minute).")
+@click.option("--quiet", is_flag=True, help="No progress bar.")
+def verify(cases: tuple[str, ...], estimates: bool, quiet: bool) -> None:
+    """Run cases (all by default) as the sheet states them, and compare with its figures."""
     if estimates:
         if cases:
             raise InputError("CASE", " ".join(cases), "leave it out: --estimates takes all cases")
@@ -255,12 +231,13 @@ def verify(
     for error in errors:
         _say(error)
     if errors or not ok:
-        raise typer.Exit(1)
+        sys.exit(1)
 
 
 @app.command()
-def plot(folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a run.")]) -> None:
-    """Draw the pictures of a run anew, from its files."""
+@click.argument("folder", type=PATH, metavar="DIR")
+def plot(folder: Path) -> None:
+    """Draw the pictures of the run in a folder anew, from its files."""
     from extrusion import plots
 
     if _rank() == 0:
@@ -269,10 +246,16 @@ def plot(folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder 
 
 
 @app.command()
-def study(
-    name: Annotated[str, typer.Argument(metavar="hard-cases", help="Which study.")] = "hard-cases",
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of its table and picture.")] = Path("results/study"),
-) -> None:
+@click.argument("name", metavar="hard-cases", default="hard-cases")
+@click.option(
+    "--out",
+    type=PATH,
+    default=Path("results/study"),
+    show_default=True,
+    metavar="DIR",
+    help="Folder of its table and picture.",
+)
+def study(name: str, out: Path) -> None:
     """Run a study, or what is left of it (a quarter of an hour); writes a table as it goes, and a picture."""
     if name != "hard-cases":
         raise InputError("study", name, "the only study is hard-cases")
@@ -325,14 +308,20 @@ def _verify_estimates(quiet: bool) -> None:
     out = [check for check in found if not check.ok]
     if out:
         _say(f"{len(out)} of {len(found)} estimates are more than 2 times too small or 10 times too large")
-        raise typer.Exit(1)
+        sys.exit(1)
 
 
 @app.command()
-def bench(
-    quick: Annotated[bool, typer.Option("--quick", help="A small part of it, on shipped meshes: two minutes.")] = False,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of its tables and picture.")] = Path("results/bench"),
-) -> None:
+@click.option("--quick", is_flag=True, help="A small part of it, on shipped meshes: two minutes.")
+@click.option(
+    "--out",
+    type=PATH,
+    default=Path("results/bench"),
+    show_default=True,
+    metavar="DIR",
+    help="Folder of its tables and picture.",
+)
+def bench(quick: bool, out: Path) -> None:
     """Measure speed against error, or what is left to measure (half an hour); writes tables and a picture."""
     from extrusion.check import require_dolfinx
 
@@ -355,23 +344,23 @@ def bench(
 
 
 @app.command()
+@click.argument("case", metavar="CASE|FILE.toml", default="A")
+@click.option("--dim", type=int, metavar="2|3", help="Triangles or hexahedra; by default what the case needs.")
+@click.option("--size", type=float, metavar="MM", help="Element size on the billet's side; else the case's divisions.")
+@click.option(
+    "--sectors", type=int, metavar="N", help="Hexahedra over the quarter turn; by default 10, or by the size."
+)
+@click.option("--order", type=int, metavar="1|2", help="Order of the hexahedra's shape; by default the case's.")
+@click.option("--out", type=PATH, metavar="FILE.msh", help="By default CASE.msh.")
 def mesh(
-    case: CaseName = "A",
-    dim: Annotated[
-        int | None, typer.Option(metavar="2|3", help="Triangles or hexahedra; by default what the case needs.")
-    ] = None,
-    size: Annotated[
-        float | None, typer.Option(metavar="MM", help="Element size on the billet's side; else the case's divisions.")
-    ] = None,
-    sectors: Annotated[
-        int | None, typer.Option(metavar="N", help="Hexahedra over the quarter turn; by default 10, or by the size.")
-    ] = None,
-    order: Annotated[
-        int | None, typer.Option(metavar="1|2", help="Order of the hexahedra's shape; by default the case's.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(metavar="FILE.msh", help="By default CASE.msh.")] = None,
+    case: str,
+    dim: int | None,
+    size: float | None,
+    sectors: int | None,
+    order: int | None,
+    out: Path | None,
 ) -> None:
-    """Mesh a case: triangles by gmsh, hexahedra without."""
+    """Mesh a case (A by default): triangles by gmsh, hexahedra without."""
     with _as_options({"dim", "size", "sectors", "order"}):
         from extrusion.result import changed
 
@@ -413,18 +402,21 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
     """
     atexit.register(gc.freeze)  # the interpreter would look for cycles in all that is left, for a third of a second
     try:
-        command = typer.main.get_command(app)
-        status = command.main(None if args is None else [*args], prog_name="extrusion", standalone_mode=False)
-        if status == INTERRUPTED:  # typer's own, of a KeyboardInterrupt
-            _say("interrupted")
-        sys.exit(status if isinstance(status, int) else 0)
+        with app.make_context("extrusion", [*(sys.argv[1:] if args is None else args)]) as context:
+            app.invoke(context)
+        sys.exit(0)
+    except click.exceptions.Exit as done:  # after help, or the version
+        sys.exit(done.exit_code)
     except InputError as error:
         _say(str(error))
         sys.exit(2)
-    except typer.TyperException as error:
-        _say(_with_value(error.format_message(), sys.argv[1:] if args is None else args))
+    except click.exceptions.NoArgsIsHelpError as error:
+        print(error.format_message())
         sys.exit(2)
-    except typer.Abort:
+    except click.ClickException as error:
+        _say(error.format_message())
+        sys.exit(2)
+    except KeyboardInterrupt:
         _say("interrupted")
         sys.exit(INTERRUPTED)
     except Exception as error:
@@ -492,17 +484,6 @@ def _say(message: str) -> None:
     """One line on stderr, from rank 0."""
     if message and _rank() == 0:
         print("extrusion:", " ".join(message.split()), file=sys.stderr)
-
-
-def _with_value(message: str, args: Sequence[str]) -> str:
-    """Typer's words for an option that is no number, with the value that it leaves out."""
-    found = re.match(r"Invalid value for '(--\w+)': Input should be a valid (integer|number)", message)
-    if found is None:
-        return message
-    name, kind = found.groups()
-    values = [value for option, value in pairwise(args) if option == name]
-    values += [arg.removeprefix(f"{name}=") for arg in args if arg.startswith(f"{name}=")]
-    return f"{name} = {values[-1]!r}: give {'an integer' if kind == 'integer' else 'a number'}" if values else message
 
 
 def _by_interrupt(error: BaseException | None) -> bool:
