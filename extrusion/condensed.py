@@ -20,8 +20,6 @@ import logging
 import os
 import time
 import weakref
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -309,8 +307,8 @@ class Condensed(System):
         self.set_solver(ksp)
         self._tangent.forget()
         ksp.setOperators(self.tangent(x, False))
-        with self._tangent.closely():  # no step of Newton's method mends what is left
-            ksp.solve(f, y)
+        self._tangent.set_accuracy(0.0, 0.0)  # no step of Newton's method mends what is left
+        ksp.solve(f, y)
         ksp.destroy()
         y.array[:1] = 0.0
         K = self.point_displacements(y, {"K": self._watch["K"]})["K"][1]
@@ -430,6 +428,10 @@ class Condensed(System):
         pc = ksp.getPC()
         pc.setType("python")
         pc.setPythonContext(self._tangent)
+
+    def set_accuracy(self, ksp: PETSc.KSP, tolerance: float, share: float) -> None:
+        closely = self.solves_closely
+        self._tangent.set_accuracy(0.0 if closely else min(share, LOOSEST), 0.0 if closely else 0.3 * tolerance)
 
     def tangent_without_contact(self) -> PETSc.Mat:
         return self._A
@@ -596,11 +598,7 @@ class _Tangent:
     def __init__(self, system: Condensed) -> None:
         self._system = weakref.proxy(system)  # PETSc holds this object in C
         self._dtype: Any = _precision(system.case.method, system.n_forces)
-        # how closely systems are solved, in parts of the right-hand side: as closely as Newton's method converges
-        # (Eisenstat, Walker, SIAM J. Sci. Comput. 17 (1996) 16, doi:10.1137/0917003)
-        self._rtol = 1e-6 if self._dtype == np.float32 else 1e-11
-        self._most = self._rtol if system.solves_closely else LOOSEST
-        self._last_norm = np.inf
+        self.set_accuracy(0.0, 0.0)
         self._getrs = scipy.linalg.get_lapack_funcs("getrs", dtype=self._dtype)
         # of each body, which forces have a part in the solve, and the rows of C that are read
         self._held = [(np.zeros(C.shape[0], dtype=bool), slice(0, 0)) for C in system.C]
@@ -611,14 +609,10 @@ class _Tangent:
         """Factor the next tangent anew."""
         self._lu: Any = None
 
-    @contextmanager
-    def closely(self) -> Iterator[None]:
-        """Solve as closely as the precision allows."""
-        most, self._most = self._most, self._rtol
-        try:
-            yield
-        finally:
-            self._most = most
+    def set_accuracy(self, share: float, rest: float) -> None:
+        """Leave this part of the right-hand side, or this much of it (N), but for what the precision cannot do."""
+        self._share = max(share, 1e-6 if self._dtype == np.float32 else 1e-11)
+        self._rest = rest
 
     def set(self, D: _Derivative | None, f: Array) -> None:
         """Take a derivative and the forces it belongs to (on rank 0). Collective."""
@@ -812,8 +806,7 @@ class _Tangent:
         x = np.where(self._acts, 0.0, F / np.where(self._acts, 1.0, self._diagonal))  # where nothing acts
         left = F - self._image(x) if x.any() else F.copy()
         norm = float(np.linalg.norm(F))
-        tolerance = norm * min(max(self._rtol, 0.1 * (norm / self._last_norm) ** 2), self._most)
-        self._last_norm = norm or np.inf
+        tolerance = max(self._share * norm, self._rest)
         turn = 0
         while np.linalg.norm(left[self._entries]) > tolerance:
             if turn == 1 and not self._fresh:

@@ -157,6 +157,29 @@ def test_prediction_saves_iterations() -> None:
     assert with_ < 0.8 * without
 
 
+@pytest.mark.parametrize(("theta", "closely"), [(0, False), (-1, True)])
+def test_no_closer_than_needed(theta: int, closely: bool) -> None:
+    """A linear solve leaves as much as Newton's method may, but for the methods that cannot do with less."""
+    case = replace(cases.A, method="nitsche", order=2, size=4.0, theta=theta).with_increment(10, 10)
+    condensed = Condensed(scene(case))
+    newton = Newton(condensed)
+    for _ in steps(condensed, newton, case.times()):
+        pass
+    x, ksp = condensed.x, newton.snes.getKSP()
+    f, y, image = (x.duplicate() for _ in range(3))
+    x.array[1:] *= 1.01
+    condensed.residual(x, f)
+    ksp.setOperators(condensed.tangent(x, True))
+    assert f.norm() > 1e4
+    for tolerance, share in ((10.0, 0.0), (0.0, 1e-6), (0.0, 1e-2)):
+        condensed.set_accuracy(ksp, tolerance, share)
+        ksp.solve(f, y)
+        ksp.getOperators()[0].mult(y, image)
+        image.axpy(-1.0, f)
+        most = 1e-10 * f.norm() if closely else max(0.3 * tolerance, min(share, 1e-4) * f.norm())
+        assert (0.0 if closely else 1e-4 * most) < image.norm() <= most
+
+
 @pytest.mark.parametrize("surface", [True, False])
 def test_a_soft_slave_goes_through(surface: bool) -> None:
     """With linear solves to a hundredth the surface stopped at t = 15, where the solve with all unknowns goes on."""
