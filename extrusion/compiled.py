@@ -13,14 +13,27 @@ from functools import cache
 from importlib import resources
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from mpi4py import MPI  # noqa: F401  the wheel's DOLFINx needs the MPI that it loads
 
 import cffi
+from numpy.typing import NDArray
 
 from dolfinx.jit import get_options
 
 from extrusion.errors import InputError
+
+
+def pointer(array: NDArray[Any]) -> Any:
+    """C's pointer to a contiguous array's numbers, which must outlive it."""
+    return FFI.from_buffer(KINDS[array.dtype.str[1:]], array)
+
+
+FFI = cffi.FFI()
+
+KINDS = {"f4": "float[]", "f8": "double[]", "i4": "int32_t[]", "i8": "int64_t[]", "b1": "int8_t[]"}
+"""Of NumPy's numbers in C."""
 
 
 @cache
@@ -33,6 +46,8 @@ def library(name: str) -> ModuleType:
         InputError: There is no C compiler that works, or the cache cannot be written.
     """
     header, source = (resources.files("extrusion").joinpath(f"{name}.{kind}").read_text("utf-8") for kind in "hc")
+    if "REAL" in source:
+        source = "".join(source.replace("REAL", kind) for kind in ("float", "double"))
     options = get_options()
     arguments = [*options["cffi_extra_compile_args"], "-std=c17", "-O3", "-fno-fast-math", "-ffp-contract=off"]
     suffix = sysconfig.get_config_var("EXT_SUFFIX")

@@ -14,11 +14,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse
-from numpy.typing import NDArray
 
-from extrusion.compiled import blocks
+from extrusion.compiled import blocks, pointer
 from extrusion.gap import Array, Index
 
 WHOLE = 400
@@ -79,8 +76,11 @@ class Block:
         r = len(self.before)
         return np.concatenate([self.U[:, :r] @ self.before, self.D, self.U[:, r:] @ self.after], axis=1)
 
-    def part(self, rows: Index, columns: slice, plus: Any = None, of: Index | None = None) -> Block:
-        """Some rows, over a range of columns; ``plus`` (a sparse matrix) times other rows ``of`` added to them."""
+    def part(self, rows: Index, columns: slice, links: tuple[Index, Index, Array] | None = None) -> Block:
+        """Some rows, over a range of columns.
+
+        ``links``: to which of them to add which other rows, times what.
+        """
         width = columns.stop - columns.start
         start, stop = (min(max(at - columns.start, 0), width) for at in (self.near.start, self.near.stop))
         first = columns.start + start - self.near.start
@@ -92,7 +92,7 @@ class Block:
             before = before[:0]
         if stop == width:
             after = after[:0]
-        D, U = (a[rows] if plus is None else a[rows] + plus @ a[of] for a in (D, U))
+        D, U = (_linked(a, rows, links) for a in (D, U))
         return Block(slice(start, stop), D, U, before, after)
 
 
@@ -106,13 +106,11 @@ class Blocks:
 
     def __init__(self, parts: Sequence[tuple[int, int, Block]]) -> None:
         parts = [part for part in parts if len(part[2].D)]
-        ffi, self._dtype = blocks().ffi, parts[0][2].D.dtype if parts else None
+        ffi, self.dtype = blocks().ffi, parts[0][2].D.dtype if parts else None
         self._held: list[Array] = []  # C has their addresses
-        self._add = blocks().lib.add_float if self._dtype == np.float32 else blocks().lib.add_double
-        self._kind = "float[]" if self._dtype == np.float32 else "double[]"
-        self._of = ffi.from_buffer
-        self._blocks = ffi.new("block[]", len(parts))
-        for to, (first, column, part) in zip(self._blocks, parts, strict=True):
+        self._add = blocks().lib.add_float if self.dtype == np.float32 else blocks().lib.add_double
+        self.of = ffi.new("block[]", len(parts))
+        for to, (first, column, part) in zip(self.of, parts, strict=True):
             to.rows, to.first, to.to, to.start, to.stop = len(part.D), first, column, part.near.start, part.near.stop
             to.width = part.near.stop + part.after.shape[1]
             to.before, to.after = len(part.before), len(part.after)
@@ -125,26 +123,10 @@ class Blocks:
 
     def add(self, f: Array, out: Array) -> None:
         """Add f times the rows to ``out``; both contiguous and of the blocks' precision."""
-        if len(self._blocks):
-            if not f.dtype == out.dtype == self._dtype:
-                raise TypeError(f"{f.dtype} and {out.dtype} for blocks of {self._dtype}")
-            self._add(len(self._blocks), self._blocks, self._of(self._kind, f), self._of(self._kind, out))
-
-
-def assembled(
-    rows: NDArray[np.int32], cols: NDArray[np.int32], values: Array, shape: tuple[int, int], dtype: Any
-) -> Any:
-    """A sparse matrix by rows from triplets; those with a negative row or column are left out."""
-    ffi, lib = blocks().ffi, blocks().lib
-    real, add = ("float[]", lib.csr_float) if dtype == np.float32 else ("double[]", lib.csr_double)
-    count = len(values)
-    start, columns, out = np.empty(shape[0] + 1, np.int32), np.empty(count, np.int32), np.empty(count, dtype)
-    scratch = np.empty(count + sum(shape), np.int32)
-    integers = (ffi.from_buffer("int32_t[]", array) for array in (rows, cols, start, columns, scratch))
-    row, column, to_start, to_columns, to_scratch = integers
-    given = row, column, ffi.from_buffer("double[]", values), *shape
-    n = add(count, *given, to_start, to_columns, ffi.from_buffer(real, out), to_scratch)
-    return scipy.sparse.csr_array((out[:n].copy(), columns[:n].copy(), start), shape=shape)
+        if len(self.of):
+            if not f.dtype == out.dtype == self.dtype:
+                raise TypeError(f"{f.dtype} and {out.dtype} for blocks of {self.dtype}")
+            self._add(len(self.of), self.of, pointer(f), pointer(out))
 
 
 def _product(A: Array, largest: float) -> tuple[Array, Array, Array]:
@@ -154,6 +136,8 @@ def _product(A: Array, largest: float) -> tuple[Array, Array, Array]:
     """
     if not A.shape[1]:
         return A, A[:0], np.zeros(0)
+    import scipy.linalg  # a tenth of a second, which a small surface does not need
+
     at_random = np.random.default_rng(0).standard_normal((A.shape[1], TRIED))
     U, R, _ = scipy.linalg.qr(A @ at_random, mode="economic", pivoting=True, check_finite=False)
     size = np.abs(np.diag(R)) / (max(largest, 1e-300) * np.sqrt(A.shape[1]))
@@ -184,7 +168,9 @@ class Compliance:
 
     def missing(self, forces: Index) -> list[int]:
         """The blocks of some forces that have not been made."""
-        return [int(number) for number in np.unique(self._number[forces]) if self._made[number] is None]
+        wanted = np.zeros(len(self.blocks), dtype=bool)
+        wanted[self._number[forces]] = True
+        return [number for number in np.flatnonzero(wanted).tolist() if self._made[number] is None]
 
     def make(self, number: int, rows: Array) -> None:
         """Take the rows of a block."""
@@ -212,13 +198,17 @@ class Compliance:
         self._all.add(f, out)
         return out
 
-    def parts(self, kept: Index, others: Index, E: Any, columns: slice) -> Iterator[tuple[int, int, Block, Block]]:
-        """Rows of kept forces, E times those of others added to them, and rows of the others, over some columns.
+    def parts(
+        self, kept: Index, others: Index, links: tuple[Index, Index, Array], columns: slice
+    ) -> Iterator[tuple[int, int, Block, Block]]:
+        """Rows of kept forces, to which those of others are added, and rows of the others, over some columns.
 
         In the lower precision, block by block: the first of the kept, the first of the others, and their rows. Both
-        are in order; E links forces of the same node alone.
+        are in order; ``links`` say to which of the kept to add which of the others (in order, of the same node), times
+        what.
         """
         ends = [np.searchsorted(forces, [rows.stop for rows in self.blocks]).tolist() for forces in (kept, others)]
+        to, linked, slope = links
         last = [0, 0]
         for number, (rows, a, b) in enumerate(zip(self.blocks, *ends, strict=True)):
             (k, o), last = (slice(last[0], a), slice(last[1], b)), [a, b]
@@ -226,9 +216,18 @@ class Compliance:
             if made is None or (k.start == k.stop and o.start == o.stop):
                 continue
             of_k, of_o = kept[k] - rows.start, others[o] - rows.start
-            other = made[-1].part(of_o, columns)
-            if not len(of_o):
-                yield k.start, o.start, made[-1].part(of_k, columns), other
-            else:
-                link = E if len(self.blocks) == 1 else E[k, o]
-                yield k.start, o.start, made[-1].part(of_k, columns, link, of_o), other
+            here = slice(*np.searchsorted(linked, [o.start, o.stop]).tolist())
+            mine = to[here] - k.start, of_o[linked[here] - o.start], slope[here]
+            yield k.start, o.start, made[-1].part(of_k, columns, mine), made[-1].part(of_o, columns)
+
+
+def _linked(A: Array, rows: Index, links: tuple[Index, Index, Array] | None) -> Array:
+    """Rows of a matrix; see `Block.part`."""
+    out = A[rows]
+    to, of, slope = links or (rows[:0], rows[:0], A[0, :0])
+    while len(to):  # one at each row at a time: three forces of a node may be two links
+        first = np.unique(to, return_index=True)[1]
+        out[to[first]] += slope[first, None] * A[of[first]]
+        rest = np.delete(np.arange(len(to)), first)
+        to, of, slope = to[rest], of[rest], slope[rest]
+    return out

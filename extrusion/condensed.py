@@ -28,17 +28,16 @@ from mpi4py import MPI  # noqa: F401  the wheel's PETSc needs the MPI that it lo
 from petsc4py import PETSc
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse
 
 from dolfinx.fem.petsc import get_petsc_lib
 
-from extrusion.compiled import blocks
-from extrusion.compliance import Blocks, Compliance, assembled
+from extrusion.compiled import blocks, pointer
+from extrusion.compliance import Blocks, Compliance
 from extrusion.errors import InputError
 from extrusion.gap import Array, Index
 from extrusion.mesh import on_root
 from extrusion.problem import BILLET_POINTS, Problem
+from extrusion.sparse import Sparse, Triplets
 from extrusion.system import System, in_words, node_positions
 
 log = logging.getLogger(__name__)
@@ -236,6 +235,7 @@ class Condensed(System):
             Compliance(self._row_of_z[self.z_forced[of]] - rows.start, self.node[of], rows.stop - rows.start, single)
             for of, rows in zip(self.of_body, self.bodies, strict=True)
         ]
+        self._provided = np.zeros(self.n_forces, dtype=bool)
         self._drive_norm = self.full.size_of_drive()
         self.seconds = {"factor": time.perf_counter() - began, "condensation": 0.0}
         bodies = np.bincount(self.force_body, minlength=2)
@@ -260,7 +260,8 @@ class Condensed(System):
     def provide(self, wanted: Index) -> None:
         """Make the columns of C for some forces (given on rank 0), and for those beside them. Collective."""
         missing: list[tuple[int, int]] = []
-        if self.on_root:
+        if self.on_root and not self._provided[wanted].all():
+            self._provided[wanted] = True
             for body, (C, of) in enumerate(zip(self.C, self.of_body, strict=True)):
                 if not (body == 1 and self._stiff_die):
                     mine = wanted[self.force_body[wanted] == body] - of.start
@@ -414,8 +415,7 @@ class Condensed(System):
             rows, cols, values = self.contact_tangent(z, geometric, wanted, self._row_of_z >= 0)
         if self.on_root:
             f = self._split(x)[1]
-            some = values != 0.0
-            D = _Derivative(self._force_of_z[rows[some]], self._row_of_z[cols[some]], values[some])
+            D = Triplets.placed(rows, cols, values, self._force_of_z, self._row_of_z)
         self._tangent.set(D, f)
         return self._A
 
@@ -563,15 +563,6 @@ class _Factor:
         return out
 
 
-@dataclass(frozen=True)
-class _Derivative:
-    """Triplets of contact forces and multiplier rows by displacements read and multipliers."""
-
-    rows: Index
-    cols: Index
-    values: Array
-
-
 class _Tangent:
     """``-1 - D C`` over the forces, and D's columns of the multipliers: PETSc's matrix of it, and its solver.
 
@@ -599,7 +590,6 @@ class _Tangent:
         self._system = weakref.proxy(system)  # PETSc holds this object in C
         self._dtype: Any = _precision(system.case.method, system.n_forces)
         self.set_accuracy(0.0, 0.0)
-        self._getrs = scipy.linalg.get_lapack_funcs("getrs", dtype=self._dtype)
         # of each body, which forces have a part in the solve, and the rows of C that are read
         self._held = [(np.zeros(C.shape[0], dtype=bool), slice(0, 0)) for C in system.C]
         self._pressed = np.zeros(system.n_multipliers, dtype=bool)  # multipliers that have a part in the solve
@@ -614,8 +604,11 @@ class _Tangent:
         self._share = max(share, 1e-6 if self._dtype == np.float32 else 1e-11)
         self._rest = rest
 
-    def set(self, D: _Derivative | None, f: Array) -> None:
-        """Take a derivative and the forces it belongs to (on rank 0). Collective."""
+    def set(self, D: Triplets | None, f: Array) -> None:
+        """Take a derivative, and the forces it belongs to (on rank 0). Collective.
+
+        D: contact forces and multiplier rows by displacements read and multipliers.
+        """
         system = self._system
         n_f = system.n_forces
         involved = np.zeros(0, dtype=np.int64)
@@ -638,12 +631,14 @@ class _Tangent:
         self._hold(D)
         # multipliers that are not pressed have no row
         shape = len(self._entries), len(self._cols)
-        self._D = assembled(self._row[D.rows], self._col[D.cols], D.values, shape, self._dtype)
+        self._D = D.assembled(self._row, self._col, shape, self._dtype)
         self._fresh = self._lu is None
         if self._lu is None:
             self._factor(self.PARALLEL)
+        else:
+            self._compile()
 
-    def _hold(self, D: _Derivative) -> None:
+    def _hold(self, D: Triplets) -> None:
         """C, and the multipliers, for all that acts and all that is read; if some has not been so, factor anew."""
         system, n_f = self._system, self._system.n_forces
         read = np.zeros(system.n_read + system.n_multipliers, dtype=bool)
@@ -698,40 +693,58 @@ class _Tangent:
         n, kept = self._n, self._kept = ends[2], ends[3]
         follower, two = self._entries[follower], self._entries[two]
         self._set_entries(self._entries[order])
-        self._follower, self._two, self._slope = self._row[follower], self._row[two], slope.astype(self._dtype)
-        self._D = self._D[order]
-        self._B = self._D[:kept, :n_u]
+        self._follower, self._two = (self._row[of].astype(np.int64) for of in (follower, two))
+        self._slope = slope.astype(self._dtype)
+        self._D = self._D.rows(order)
         C_E, C_h = [], []
         M = np.zeros((kept, kept), dtype=self._dtype)
-        E = scipy.sparse.csr_array((self._slope, (self._two, self._follower)), shape=(kept, len(order)))
-        for b, cols in enumerate((slice(self._from_die), slice(self._from_die, n_u))):
+        in_order = np.argsort(self._follower)
+        for b, cols in enumerate((slice(0, self._from_die), slice(self._from_die, n_u))):
             lead, other = slice(ends[b], ends[b + 1]), slice(ends[b + 3], ends[b + 4])
             of = (self._entries[rows] - system.of_body[b].start for rows in (lead, other))
-            B = self._B[:, cols]
-            for k, o, with_others, others in system.C[b].parts(*of, E[lead, other], self._held[b][1]):
+            here = in_order[slice(*np.searchsorted(self._follower[in_order], [other.start, other.stop]))]
+            links = self._two[here] - lead.start, self._follower[here] - other.start, self._slope[here]
+            for k, o, with_others, others in system.C[b].parts(*of, links, self._held[b][1]):
                 first = lead.start + k
-                M[:, first : first + len(with_others.D)] = B @ np.ascontiguousarray(with_others.whole().T)
-                C_E.append((first, cols.start or 0, with_others))
-                C_h.append((other.start + o, cols.start or 0, others))
-        self._C_E, self._C_h = Blocks(C_E), Blocks(C_h)
+                self._D.add_times(cols, with_others.whole().T, M[:, first : first + len(with_others.D)])
+                C_E.append((first, cols.start, with_others))
+                C_h.append((other.start + o, cols.start, others))
+        self._blocks = Blocks(C_E), Blocks(C_h)
         M[n:, :n] *= -1.0
         M[np.arange(n), np.arange(n)] += 1.0
-        pressed = self._D[:kept, n_u:].toarray()
+        pressed = self._D.first(kept, slice(n_u, len(self._cols)))
         M[:n, n:] = -pressed[:n]
         M[n:, n:] = pressed[n:]
-        self._lu = scipy.linalg.lu_factor(M.T, overwrite_a=True, check_finite=False) if kept else ()
+        self._lu = _factored(M)
+        self._compile()
+
+    def _compile(self) -> None:
+        """The ``tangent`` of ``blocks.h``, and what it points to."""
+        own, others = self._blocks
+        arrays = {
+            "start": self._D.start, "columns": self._D.columns, "values": self._D.values,
+            "follower": self._follower, "leader": self._two, "slope": self._slope, **self._lu,
+        }  # fmt: skip
+        numbers = {
+            "rows": len(self._entries), "forces": self._n, "kept": self._kept, "width": len(self._cols),
+            "displacements": len(self._cols) - int(np.count_nonzero(self._pressed)), "n_own": len(own.of),
+            "n_others": len(others.of), "n_followers": len(self._follower),
+        }  # fmt: skip
+        pointers = {name: pointer(array) for name, array in arrays.items()}
+        of = blocks().ffi.new("tangent *", {**numbers, **pointers, "own": own.of, "others": others.of})
+        self._compiled = of, arrays
 
     def _leaders(self, parallel: float) -> tuple[Index, Index, Index, Array]:
         """Rows that are kept; others, the kept one of the same node that each goes with, and in what proportion."""
         system, D, m = self._system, self._D, np.count_nonzero(self._pressed)
         is_force = self._entries < system.n_forces
-        row = np.repeat(np.arange(len(is_force)), np.diff(D.indptr))
-        pressed, on_force = D.indices >= D.shape[1] - m, is_force[row]
+        row = D.row
+        pressed, on_force = D.columns >= D.width - m, is_force[row]
         if (pressed & on_force).any() and not on_force.all():
             # by pressures as by displacements, each times a stiffness
-            scale = np.max(np.abs(D.data[~on_force])) / np.max(np.abs(D.data[pressed & on_force]))
-            D = scipy.sparse.csr_array((np.where(pressed, scale, 1.0) * D.data, D.indices, D.indptr), shape=D.shape)
-        square = np.bincount(row, D.data**2, len(is_force))
+            scale = np.max(np.abs(D.values[~on_force])) / np.max(np.abs(D.values[pressed & on_force]))
+            D = Sparse(D.start, D.columns, np.where(pressed, scale, 1.0).astype(self._dtype) * D.values, D.width)
+        square = np.bincount(row, D.values**2, len(is_force))
         acts = is_force & (square > 0.0)
         on = np.flatnonzero(acts)
         node = system.node[self._entries[on]]
@@ -739,54 +752,25 @@ class _Tangent:
         first = np.diff(node[by_node], prepend=-1) != 0
         largest = np.maximum.accumulate(np.where(first, np.arange(len(on)), 0))
         other, to = on[by_node[~first]], on[by_node[largest[~first]]]
-        slope = D[other].multiply(D[to]).sum(axis=1) / square[to]
+        slope = D.products(other, to) / square[to]
         goes = square[other] - slope**2 * square[to] <= np.copysign(parallel**2, parallel) * square[to]
         acts[other[goes]] = False
         return np.flatnonzero(acts), other[goes], to[goes], slope[goes]
 
-    def _correct(self, F: Array) -> tuple[Array, Array]:
-        """Forces and multipliers whose image is nearly F, and their image."""
-        n, kept = self._n, self._kept
-        F = F.astype(self._dtype)  # a copy
-        F[self._follower] -= self._slope * F[self._two]
-        u = np.zeros(len(self._cols), dtype=self._dtype)
-        self._C_h.add(F, u)
-        w = self._B @ u[: self._B.shape[1]]
-        w[:n] -= F[:n]
-        w[n:] = F[n:kept] - w[n:]
-        if kept:  # else there are forces that no longer depend on anything
-            w = self._getrs(*self._lu, w, trans=1, overwrite_b=True)[0]
-        self._C_E.add(-w, u)
-        u[self._B.shape[1] :] = w[n:]
-        x = np.concatenate([w, -F[kept:]])
-        x[self._follower] += self._slope * w[self._two]
-        image = self._D @ u
-        image[:n] -= x[:n]
-        image[kept:] -= x[kept:]
-        return x, image
-
-    def _improve(self, F: Array, tolerance: float) -> tuple[Array, Array]:
-        """Forces and multipliers by GCR, which takes them where their image is closest to F, and what is left of F."""
-        x, Z, Q, square = np.zeros(len(F)), *np.empty((2, self.STALE, len(F))), np.empty(self.STALE)
-        for k in range(self.STALE):
-            Z[k], Q[k] = self._correct(F)
-            along = (Q[:k] @ Q[k]) / square[:k]
-            Z[k] -= along @ Z[:k]
-            Q[k] -= along @ Q[:k]
-            square[k] = Q[k] @ Q[k]
-            step = (Q[k] @ F) / square[k]
-            x += step * Z[k]
-            F = F - step * Q[k]
-            if np.sqrt(F @ F) <= tolerance:
-                break
-        return x, F
+    def _improve(self, F: Array, tolerance: float) -> Array:
+        """Forces and multipliers by GCR, which takes them where their image is closest to F; F becomes what is left."""
+        x, spaces = np.zeros(len(F)), np.empty((2 * self.STALE, len(F)))
+        scratch = np.empty(3 * len(F) + len(self._cols), self._dtype)
+        improve = blocks().lib.gcr_float if self._dtype == np.float32 else blocks().lib.gcr_double
+        improve(self._compiled[0], self.STALE, tolerance, *map(pointer, (F, x, spaces, scratch)))
+        return x
 
     def _image(self, v: Array) -> Array:
         n_f = self._system.n_forces
         read = np.concatenate([self._system.displacements(v[:n_f]), v[n_f:]])
         out = self._diagonal * v
         out[n_f:][self._pressed] = 0.0  # these stand in D
-        out[self._entries] += self._D @ read[self._cols].astype(self._dtype)
+        out[self._entries] += self._D.times(read[self._cols])
         return out
 
     def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
@@ -816,12 +800,29 @@ class _Tangent:
             if turn == 4:
                 pc.setFailedReason(PETSc.PC.FailedReason.SUBPC_ERROR)
                 break
-            step, left[self._entries] = self._improve(left[self._entries], tolerance)
-            x[self._entries] += step
+            rest = left[self._entries]
+            x[self._entries] += self._improve(rest, tolerance)
+            left[self._entries] = rest
             turn += 1
         into[0] = b.array_r[0]
         into[1:] = x
 
+
+def _factored(M: Array) -> dict[str, Any]:
+    """A matrix as ``blocks.h`` takes it, factored: a small one without SciPy, which takes 0.1 s to load."""
+    if len(M) <= SMALL:
+        interchanged = np.empty(len(M), dtype=np.int32)
+        factor = blocks().lib.factor_float if M.dtype == np.float32 else blocks().lib.factor_double
+        factor(len(M), pointer(M), pointer(interchanged))
+        return {"lu": M, "interchanged": interchanged}
+    import scipy.linalg
+
+    lu, interchanged = scipy.linalg.lu_factor(M.T, overwrite_a=True, check_finite=False)
+    return {"lu": np.ascontiguousarray(lu.T), "interchanged": interchanged.astype(np.int32)}
+
+
+SMALL = 200
+"""Unknowns up to which a matrix is small."""
 
 LOOSEST = 1e-4
 """Part of the right-hand side that a solve may leave: with a hundred times more hard steps fail, and none is faster."""

@@ -35,7 +35,7 @@ def project(trial: Array, closure: Closure, closed: NDArray[np.bool_]) -> tuple[
     Args:
         trial: Trial stress base + k gap, any shape, MPa.
         closure: ``unilateral``, ``bilateral`` or ``check``.
-        closed: Points a bilateral closure holds, same shape; a point that is not held acts unilaterally.
+        closed: Points a bilateral closure holds, a shape that broadcasts to that; what is not held acts unilaterally.
 
     Returns:
         ``sigma_n`` and ``d sigma_n / d trial`` (0 or 1), same shape as ``trial``.

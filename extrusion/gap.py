@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from extrusion.compiled import ray
+from extrusion.compiled import pointer, ray
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -95,7 +95,7 @@ class Surface:
         out, held = ray().ffi.new("surface *", {"m": m, "k": k, "K": K}), []
         for name, array in arrays.items():
             held.append(np.ascontiguousarray(array, dtype=np.float64 if array.dtype.kind == "f" else np.int64))
-            setattr(out, name, _pointer(held[-1]))
+            setattr(out, name, pointer(held[-1]))
         return out, held
 
     def reversed(self) -> Surface:
@@ -247,8 +247,8 @@ def ray_points(
     if len(z) < 2 * max(slave._last_node, die._last_node) + 2:
         raise IndexError(f"z holds {len(z)} entries, the surfaces' nodes go to {max(slave._last_node, die._last_node)}")
 
-    of = slave._compiled[0], die._compiled[0], _pointer(z), axis, sign, order
-    into = *of, _pointer(s), _pointer(omega), axisymmetric, _pointer(vertex)
+    of = slave._compiled[0], die._compiled[0], pointer(z), axis, sign, order
+    into = *of, pointer(s), pointer(omega), axisymmetric, pointer(vertex)
     n = library.lib.ray_points(*into, library.ffi.NULL)
     if n < 0:
         raise ArithmeticError("the deformed die is no graph over the ray's base line")
@@ -261,16 +261,10 @@ def ray_points(
     (
         out.facet, out.die, out.cols, out.xi, out.weight, out.gap, out.slope, out.gap_xi, out.past,
         out.G, out.G_xi, out.left, out.right, out.dxi, out.dweight,
-    ) = map(_pointer, (facet, on, cols, xi, weight, gap, slope, gap_xi, past, G, G_xi, a, b, dxi, dweight))  # fmt: skip
+    ) = map(pointer, (facet, on, cols, xi, weight, gap, slope, gap_xi, past, G, G_xi, a, b, dxi, dweight))  # fmt: skip
     filled = library.lib.ray_points(*into, out)
     assert filled == n
     return Points(facet, on, cols, xi, weight, gap, G, slope, past, gap_xi, G_xi, ((a, b), (b, a)), dxi, dweight)
-
-
-def _pointer(array: NDArray[Any]) -> Any:
-    """C's pointer to a contiguous array's numbers, which must outlive it."""
-    kind = {"f": "double[]", "i": "int64_t[]", "b": "int8_t[]"}[array.dtype.kind]
-    return ray().ffi.from_buffer(kind, array)
 
 
 def least_gap(slave: Surface, die: Surface, z: Array, axis: int, sign: float) -> float:
@@ -328,8 +322,8 @@ def stress_rows(
     strided = ray().ffi.cast("double *", d.ctypes.data)
     rows = np.zeros((n, q, 2 * K + between + 3 * mixed))
     ray().lib.stress_rows(
-        slave._compiled[0], n, q, _pointer(facet), _pointer(xi), strided, *(i // d.itemsize for i in d.strides[:2]),
-        lmbda, mu, axisymmetric, derivative, rows.shape[2], 2 * K + between if mixed else -1, _pointer(rows),
+        slave._compiled[0], n, q, pointer(facet), pointer(xi), strided, *(i // d.itemsize for i in d.strides[:2]),
+        lmbda, mu, axisymmetric, derivative, rows.shape[2], 2 * K + between if mixed else -1, pointer(rows),
     )  # fmt: skip
     return rows
 

@@ -7,7 +7,9 @@ nothing of curves or surfaces, and a pair knows no law.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -112,8 +114,8 @@ class Pair(ABC):
     @abstractmethod
     def points(
         self, z: Array, order: int, variation: bool, material: Elastic | None = None, keep: Index | None = None
-    ) -> tuple[Points, Array | None, Array | None]:
-        """Integration points, the rows of the slave's own stress there, and their derivative along the facet.
+    ) -> tuple[Points, Array | None, Callable[[], Array] | None]:
+        """Integration points, rows of the slave's own stress there, and what gives their derivative along the facet.
 
         ``keep``: die facets to stay with, from `facing`, where points are not split at the facets' edges.
         """
@@ -184,14 +186,15 @@ class Pair(ABC):
         """Of some nodes, ``shape=(*nodes.shape, dim)``, mm."""
         return np.asarray(z[self.dim * nodes[..., None] + np.arange(self.dim)])
 
-    def tested(self, points: Points) -> Index:
-        """Local columns of points that the gap depends on, the facet's nodes and the die's: ``shape=(n, L)``."""
+    @cached_property
+    def tested(self) -> Index:
+        """Local columns that the gap depends on, the facet's nodes and the die's, by slave facet: ``shape=(m, T)``."""
         slave, dim = self.slave, self.dim
-        nodes = dim * slave.local[points.facet][..., None] + np.arange(dim)
+        nodes = dim * slave.local[..., None] + np.arange(dim)
         n_u = dim * slave.cell_nodes.shape[1]
         die = np.arange(n_u, n_u + dim * self.die.nodes.shape[1] if len(self.die.nodes) else n_u)
-        n = len(points.facet)
-        return np.concatenate([nodes.reshape(n, nodes.shape[1] * dim), np.broadcast_to(die, (n, len(die)))], axis=1)
+        m = len(nodes)
+        return np.concatenate([nodes.reshape(m, -1), np.broadcast_to(die, (m, len(die)))], axis=1)
 
     def gap_of(self, body: np.ndarray, points: Points) -> tuple[Array, Index]:
         """Derivative of the gap by one body's nodes, ``shape=(n, q, L)``, and their entries of z, ``shape=(n, L)``.
@@ -200,7 +203,7 @@ class Pair(ABC):
             body: Which entries of z are of that body.
             points: At least one.
         """
-        local = self.tested(points)
+        local = self.tested[points.facet]
         local = local[:, body[points.cols[0, local[0]]]]  # all points have one layout
         return np.take_along_axis(points.G, local[:, None], axis=2), np.take_along_axis(points.cols, local, axis=1)
 
@@ -274,7 +277,7 @@ class CurvePair(Pair):
 
     def points(
         self, z: Array, order: int, variation: bool, material: Elastic | None = None, keep: Index | None = None
-    ) -> tuple[Points, Array | None, Array | None]:
+    ) -> tuple[Points, Array | None, Callable[[], Array] | None]:
         slave = self.slave
         direction: Array = self.direction
         if self.ray:
@@ -293,7 +296,7 @@ class CurvePair(Pair):
             of = slave, points.facet, points.xi, direction, material.lmbda, material.mu
             return stress_rows(*of, self.axisymmetric, derivative, n_die)
 
-        return points, rows(0), rows(1) if variation and self.ray else None
+        return points, rows(0), partial(rows, 1) if variation and self.ray else None
 
     def _closest_integration_points(self, z: Array, order: int) -> tuple[Points, Array]:
         slave = self.slave

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -94,7 +95,7 @@ class SurfacePair(Pair):
 
     def points(
         self, z: Array, order: int, variation: bool, material: Elastic | None = None, keep: Index | None = None
-    ) -> tuple[Points, Array | None, Array | None]:
+    ) -> tuple[Points, Array | None, Callable[[], Array] | None]:
         slave, some = self.slave, self._some
         if self.ray and self.axis == 0:
             points = line_points(some, self.die, z, self.sign, order, variation)
@@ -118,16 +119,20 @@ class SurfacePair(Pair):
             return np.concatenate([S[..., :n_u], between, S[..., n_u:]], axis=2)
 
         S = rows(np.ones(len(points.xi), dtype=bool), points.xi)
-        S_xi = None
-        if variation and points.dxi is not None:
-            S_xi = np.zeros_like(S)
+
+        def S_xi() -> Array:
+            assert points.dxi is not None
+            out = np.zeros_like(S)
             moving = np.abs(points.dxi).max(axis=(1, 2)) > 0
             if moving.any():
                 xi = points.xi[moving]
-                S_xi[moving] = (rows(moving, xi + STEP) - rows(moving, xi - STEP)) / (2 * STEP)
+                out[moving] = (rows(moving, xi + STEP) - rows(moving, xi - STEP)) / (2 * STEP)
+            return out
+
+        given = points
         if slave.pressure_cols is not None:
-            points = widened(points, slave.pressure_cols[points.facet])
-        return points, S, S_xi
+            given = widened(points, slave.pressure_cols[points.facet])
+        return given, S, S_xi if variation and points.dxi is not None else None
 
     def part(self, facets: Index) -> SurfacePair:
         return replace(self, facets=facets)

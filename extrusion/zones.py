@@ -14,11 +14,11 @@ from typing import Protocol
 from mpi4py import MPI
 
 import numpy as np
-import scipy.sparse
 
 from extrusion.contact import project
 from extrusion.elasticity import Elastic
 from extrusion.gap import Array, Index, Points
+from extrusion.integrand import Integrand
 from extrusion.pairs import ContactState, Pair, closed_at_start, take
 
 Triplets = tuple[Index, Index, Array]
@@ -453,14 +453,14 @@ class IntegratedContact:
         return tuple(row[order] for row in rows_)
 
     def hold(self, z: Array | None) -> None:
-        self._held = None if z is None or self._is_far(z) else self.pair.facing(self._points(z)[0])
+        self._held = None if z is None or self._is_far(z) else self.pair.facing(self._points(z).points)
 
     def soften(self, share: float) -> None:
         self._k = share * self._stiffness
 
     def start(self, z: Array) -> None:
         self._expected = Expected()
-        points = self._points(z)[0]
+        points = self._points(z).points
         held = self.pair.touches(z, points, self._radius, self._interpenetrating)
         self.closed = self._whole_facets(points, held)
         self._catch(points, self.closed)
@@ -475,9 +475,9 @@ class IntegratedContact:
         return self._expected.expect(ahead)
 
     def _found(self, z: Array) -> ContactSet | None:
-        points, S, _ = self._points(z)
-        trial = self._trial(z, points, S)[1]
-        closed = trial < 0.0
+        integrand = self._points(z)
+        points = integrand.points
+        closed = (trial := integrand.trial(z, self._k)[1]) < 0.0
         if not self.pair.extended:
             closed &= ~points.past
         return ContactSet.of(*self._of_all(points.facet, self.pair.along(z, points), trial, closed))
@@ -502,8 +502,7 @@ class IntegratedContact:
         np.logical_and.at(every, points.facet, held.all(axis=1))
         return every
 
-    def _find(self, z: Array) -> tuple[Points, Array | None, Array | None]:
-        """Contact points with the rows of the slave's own stress and their derivative, over the points' columns."""
+    def _find(self, z: Array) -> Integrand:
         found, lost = None, ""
         try:
             found = self._mine.points(z, self._order, self.pair.closure != "check", self._material, self._held)
@@ -514,86 +513,48 @@ class IntegratedContact:
             found, lost = (None, told[0]) if told else (found, "")
         if found is None:
             raise ArithmeticError(lost)
-        return found
+        return Integrand(*found)
 
-    def _trial(self, z: Array, points: Points, S: Array | None) -> tuple[Array, Array, Array]:
-        """The slave's own stress, the trial stress, and k."""
-        k = self._k[points.facet][:, None]
-        own = np.einsum("nql,nl->nq", S, z[points.cols]) if S is not None else np.zeros_like(points.gap)
-        return own, own + k * points.gap, k
-
-    def _law(self, z: Array, points: Points, S: Array | None) -> tuple[Array, Array, Array, Array]:
-        own, trial, k = self._trial(z, points, S)
-        held = np.broadcast_to(self.closed[points.facet][:, None], own.shape)
+    def _law(self, z: Array, integrand: Integrand) -> tuple[Array, Array, Array]:
+        """The slave's own stress, the contact stress, and its derivative by the trial stress."""
+        points = integrand.points
+        own, trial = integrand.trial(z, self._k)
         if self._expected.on:
             sc, dsc = self._expected.law(trial, self.pair.along(z, points))
         else:
-            sc, dsc = project(trial, self.pair.closure, held)
+            sc, dsc = project(trial, self.pair.closure, self.closed[points.facet][:, None])
         if not self.pair.extended:
             sc, dsc = np.where(points.past, 0.0, sc), np.where(points.past, 0.0, dsc)
-        return own, sc, dsc, k
+        return own, sc, dsc
 
     def add_residual(self, z: Array, R: Array) -> None:
         if self.pair.closure == "check" or (not self._theta and self._is_far(z)):
             return
-        points, S, _ = self._points(z)
-        own, sc, _, k = self._law(z, points, S)
-        force = np.einsum("nq,nql->nl", points.weight * sc, points.G)
-        if S is not None and self._theta:
-            force += np.einsum("nq,nql->nl", points.weight * self._theta / k * (sc - own), S)
-        np.add.at(R, points.cols, force)
+        integrand = self._points(z)
+        points = integrand.points
+        own, sc, _ = self._law(z, integrand)
+        consistent = None
+        if self._theta and self._material is not None:
+            consistent = points.weight * self._theta / self._k[points.facet][:, None] * (sc - own)
+        integrand.add_forces(points.weight * sc, consistent, R)
 
     def tangent(self, z: Array, geometric: bool) -> Triplets:
         if self.pair.closure == "check" or (not self._theta and self._is_far(z)):
             return _none()
-        points, S, S_xi = self._points(z)
-        own, sc, dsc, k = self._law(z, points, S)
-        theta = self._theta if S is not None else 0
-        if not theta:  # open pieces carry nothing
-            on = (dsc > 0).any(axis=1)
-            points, own, sc, dsc, k = take(points, on), own[on], sc[on], dsc[on], k[on]
-            S, S_xi = (None if a is None else a[on] for a in (S, S_xi))
-        z_local = z[points.cols]
-        w, G = points.weight[..., None], points.G
-        d_own = S if S is not None else np.zeros_like(G)
-        d_gap = G
-        if geometric and points.dxi is not None and points.gap_xi is not None:
-            d_gap = G + points.gap_xi[..., None] * points.dxi
-            if S is not None and S_xi is not None:
-                d_own = S + np.einsum("nql,nl->nq", S_xi, z_local)[..., None] * points.dxi
-        d_sc = dsc[..., None] * (d_own + k[..., None] * d_gap)
-        test = G + theta / k[..., None] * S if S is not None and theta else G
-        left, right = [w * test], [d_sc]
-        if S is not None and theta:
-            left.append(-w * theta / k[..., None] * S)
-            right.append(d_own)
-        if geometric and points.dxi is not None and points.G_xi is not None and points.dweight is not None:
-            w_sc = w * sc[..., None]
-            force, along = G * sc[..., None], w_sc * points.G_xi
-            if S is not None and S_xi is not None and theta:
-                rest = (theta / k * (sc - own))[..., None]
-                force, along = force + rest * S, along + w * rest * S_xi
-            left += [force, along]
-            right += [points.dweight, points.dxi]
-            for a, b in points.curvature:
-                left.append(w_sc * a)
-                right.append(b)
-        forces, rows = np.concatenate(left, axis=1), points.cols
-        if not theta:  # on the facet's nodes and the die's alone, not on the cell's others
-            tested = self.pair.tested(points)
-            forces, rows = np.take_along_axis(forces, tested[:, None], axis=2), np.take_along_axis(rows, tested, axis=1)
-        return _triplets(rows, points.cols, np.swapaxes(forces, 1, 2) @ np.concatenate(right, axis=1))
+        integrand = self._points(z)
+        law = self._law(z, integrand)
+        return integrand.tangent(z, self._k, *law, self._theta, geometric, self.pair.tested)
 
     def stiff(self, z: Array, body: np.ndarray) -> tuple[Triplets, Array]:
         if self.pair.closure == "check" or self._is_far(z):
             return _none(), np.zeros(0)
-        points, S, _ = self._points(z)
-        _, _, dsc, k = self._law(z, points, S)
+        integrand = self._points(z)
+        points, dsc = integrand.points, self._law(z, integrand)[2]
         on = (dsc > 0).any(axis=1)
         if not on.any():
             return _none(), np.zeros(0)
         G, cols = self.pair.gap_of(body, take(points, on))
-        w = (points.weight * dsc * k)[on]
+        w = (points.weight * dsc * self._k[points.facet][:, None])[on]
         return _triplets(cols, cols, np.swapaxes(w[..., None] * G, 1, 2) @ G), np.zeros(0)
 
     def closed_edge(self) -> tuple[Triplets, Array]:
@@ -616,15 +577,16 @@ class IntegratedContact:
         if self.pair.closure == "unilateral":
             self._expected.accept(self._found(z))
         else:
-            points, S, _ = self._points(z)
-            _, _, dsc, _ = self._law(z, points, S)
+            integrand = self._points(z)
+            points, dsc = integrand.points, self._law(z, integrand)[2]
             before = self.closed
             self.closed = before | self._whole_facets(points, dsc > 0)
             self._catch(points, self.closed & ~before)
 
     def state(self, z: Array) -> ContactState:
-        points, S, _ = self._points(z)
-        _, sc, dsc, _ = self._law(z, points, S)
+        integrand = self._points(z)
+        points = integrand.points
+        _, sc, dsc = self._law(z, integrand)
         closed = points.gap < 0 if self.pair.closure == "check" else dsc > 0
         mine = self.pair.report(z, points, sc, closed)
         return ContactState(*self._of_all(np.repeat(points.facet, points.gap.shape[1]), *vars(mine).values()))
@@ -813,6 +775,8 @@ class MortarContact:
         return ContactSet.of(self.pair.along_corners(z), trial, (trial < 0.0) & ~self._free(share))
 
     def stiff(self, z: Array, body: np.ndarray) -> tuple[Triplets, Array]:
+        import scipy.sparse
+
         kappa = self._k / self._total
         if not self.multipliers or self._is_far(z):
             return _none(), kappa[: self.multipliers]

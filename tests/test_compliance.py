@@ -8,7 +8,7 @@ import scipy.linalg
 import scipy.sparse
 from numpy.testing import assert_allclose
 
-from extrusion.compliance import FORCES, WHOLE, Block, Blocks, Compliance, assembled
+from extrusion.compliance import FORCES, WHOLE, Block, Blocks, Compliance
 from extrusion.gap import Array, Index
 
 N, READ = 1000, 2600
@@ -69,7 +69,7 @@ def test_parts(columns: slice, single: bool) -> None:
     dtype: Any = np.float32 if single else np.float64
     E = scipy.sparse.csr_array((slope.astype(dtype), (two, np.arange(len(others)))), shape=(len(kept), len(others)))
     w, h = (np.random.default_rng(4).standard_normal(len(rows)) for rows in (kept, others))
-    found = list(compliance.parts(kept, others, E, columns))
+    found = list(compliance.parts(kept, others, (two, np.arange(len(others)), slope.astype(dtype)), columns))
     accuracy = 1e-5 if single else 1e-11
     for vector, rows, blocks in (
         (w, C[kept] + E @ C[others], [(k, 3, block) for k, _, block, _ in found]),
@@ -92,21 +92,17 @@ def test_a_block_is_as_wide_as_its_forces() -> None:
     assert_allclose(block.whole(), rows, atol=1e-12)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_assembled(dtype: Any) -> None:
-    """Equal places added up, empty rows, and what has no place."""
-    rng = np.random.default_rng(5)
-    rows, cols = (rng.integers(-1, n, 500).astype(np.int32) for n in (30, 20))
-    rows[rows == 7] = 8
-    values = rng.standard_normal(500)
-    found = assembled(rows, cols, values, (30, 20), dtype)
-    on = (rows >= 0) & (cols >= 0)
-    expected = scipy.sparse.coo_array((values[on], (rows[on], cols[on])), shape=(30, 20)).toarray()
-    assert found.dtype == dtype
-    assert found.nnz == np.count_nonzero(expected)
-    assert_allclose(found.toarray(), expected, atol=1e-6 if dtype == np.float32 else 1e-14)
-    none = np.zeros(0, dtype=np.int32)
-    assert assembled(none, none, np.zeros(0), (3, 2), dtype).nnz == 0
+def test_two_links_of_a_row() -> None:
+    """The three forces of a node in space may be one row, with two others added to it."""
+    C, own = smooth()
+    compliance = Compliance(own, own // 4, READ, False)
+    for number in compliance.missing(np.arange(N)):
+        compliance.make(number, C[compliance.blocks[number]])
+    kept, others = np.array([8, 500]), np.array([9, 10, 501, 502])
+    links = np.array([0, 0, 1, 1]), np.arange(4), np.array([0.5, -2.0, 3.0, 0.25])
+    found = [block for _, _, block, _ in compliance.parts(kept, others, links, slice(0, READ))]
+    expected = C[kept] + [0.5 * C[9] - 2 * C[10], 3 * C[501] + 0.25 * C[502]]
+    assert_allclose(np.concatenate([block.whole() for block in found]), expected, atol=1e-10)
 
 
 @pytest.mark.parametrize("single", [False, True])
@@ -125,7 +121,7 @@ def test_matrices_that_run_down_their_columns(single: bool, monkeypatch: pytest.
     assert_allclose(compliance.displacements(f), f @ C, rtol=0, atol=1e-12 * np.abs(C).max() * np.abs(f).sum())
     out = np.zeros(READ, dtype=np.float32 if single else np.float64)
     every, none = np.arange(N), np.zeros(0, dtype=int)
-    parts = compliance.parts(every, none, None, slice(0, READ))
+    parts = compliance.parts(every, none, (none, none, np.zeros(0)), slice(0, READ))
     Blocks([(k, 0, block) for k, _, block, _ in parts]).add(f.astype(out.dtype), out)
     assert_allclose(out, f @ C, rtol=0, atol=(1e-6 if single else 1e-12) * np.abs(C).max() * np.abs(f).sum())
     with pytest.raises(TypeError, match="float64"):
@@ -137,7 +133,9 @@ def test_nothing_far_away() -> None:
     own = np.arange(0, READ, 2)
     C = np.exp(-3.0 * np.abs(own[:, None] - np.arange(READ)))
     compliance = made(C, own)
-    found = [block for _, _, block, _ in compliance.parts(np.arange(len(own)), own[:0], None, slice(0, READ))]
+    none = own[:0]
+    parts = compliance.parts(np.arange(len(own)), none, (none, none, np.zeros(0)), slice(0, READ))
+    found = [block for _, _, block, _ in parts]
     assert min(block.U.shape[1] for block in found) == 0
     assert_allclose(np.concatenate([block.whole() for block in found]), C, atol=1e-13)
     assert found[0].part(np.arange(3), slice(2000, READ)).whole().shape == (3, READ - 2000)
