@@ -411,8 +411,8 @@ class Condensed(System):
         D, f = None, np.zeros(0)
         z = self._evaluated(x)
         if self.on_root or self.divided:
-            wanted = (self._force_of_z >= 0) & self.on_root
-            rows, cols, values = self.contact_tangent(z, geometric, wanted, self._row_of_z >= 0)
+            wanted = ((self._force_of_z >= 0) & self.on_root, self._row_of_z >= 0) if self.divided else ()
+            rows, cols, values = self.contact_tangent(z, geometric, *wanted)
         if self.on_root:
             f = self._split(x)[1]
             D = Triplets.placed(rows, cols, values, self._force_of_z, self._row_of_z)

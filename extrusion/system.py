@@ -117,17 +117,20 @@ class System(ABC):
                 self.comm.Allreduce(MPI.IN_PLACE, R)
         return R
 
-    def contact_tangent(self, z: Array, geometric: bool, rows: np.ndarray, cols: np.ndarray) -> Triplets:
+    def contact_tangent(
+        self, z: Array, geometric: bool, rows: np.ndarray | None = None, cols: np.ndarray | None = None
+    ) -> Triplets:
         """Its derivative as (rows, columns, values).
 
         Args:
             z: Where.
             geometric: Whether to add the second variation of the gap.
-            rows: Which rows to give, ``shape=(n_z,)``.
+            rows: Which rows to give, ``shape=(n_z,)``; by default, where terms are not divided, all.
             cols: And which columns.
         """
         with self._pairs():
-            return self.of_all([term.tangent(z, geometric) for term in self.terms], rows, cols)
+            parts = [term.tangent(z, geometric) for term in self.terms]
+            return joined(parts) if rows is None or cols is None else self.of_all(parts, rows, cols)
 
     def of_all(self, parts: list[Triplets], rows: np.ndarray, cols: np.ndarray) -> Triplets:
         """Some rows and columns of all zones' triplets, and of all ranks' where terms are divided (collective then)."""
