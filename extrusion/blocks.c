@@ -1,4 +1,4 @@
-/* See `blocks.h`. Compiled for float and for double in place of REAL (`extrusion/compiled.py`). */
+/* See `blocks.h`. Compiled for float and for double in place of REAL; WIDE: `extrusion/compiled.py`. */
 #include <math.h>
 #include <string.h>
 
@@ -10,13 +10,6 @@ enum
   most_ranks = 256, /* before and after, together */
   lanes = 16        /* partial sums of a product */
 };
-
-/* Loops over long rows: twice as wide where the processor can. Sums come in the same order in both. */
-#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__linux__)
-#define WIDE __attribute__((target_clones("avx2", "default")))
-#else
-#define WIDE
-#endif
 
 int64_t placed(int64_t count, const int64_t* row, const int64_t* column, const double* value, const int64_t* row_of,
                const int64_t* column_of, int32_t* rows, int32_t* columns, double* values)

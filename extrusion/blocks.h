@@ -14,7 +14,7 @@ typedef struct
 void add_double(int64_t count, const block* blocks, const double* vector, double* out);
 void add_float(int64_t count, const block* blocks, const float* vector, float* out);
 
-/* Triplets with a place in a matrix: their row and column there, of those that have both and are not 0. Their number. */
+/* Triplets with a place in a matrix: their row and column there, of those that have both and are not 0. How many. */
 int64_t placed(int64_t count, const int64_t* row, const int64_t* column, const double* value, const int64_t* row_of,
                const int64_t* column_of, int32_t* rows, int32_t* columns, double* values);
 
@@ -30,23 +30,23 @@ int64_t csr_float(int64_t count, const int32_t* row, const int32_t* column, cons
                   float* values, int32_t* scratch);
 
 /* Compressed rows by a vector. */
-void csr_times_double(int64_t rows, const int32_t* start, const int32_t* columns, const double* values, const double* vector,
-                    double* out);
+void csr_times_double(int64_t rows, const int32_t* start, const int32_t* columns, const double* values,
+                      const double* vector, double* out);
 
 /* out += their columns from .. to by a matrix of n columns. stride: from row to row of out. */
 void csr_matrix_double(int64_t rows, const int32_t* start, const int32_t* columns, const double* values, int64_t from,
-                     int64_t to, const double* matrix, int64_t n, double* out, int64_t stride);
+                       int64_t to, const double* matrix, int64_t n, double* out, int64_t stride);
 
 /* Products of pairs of rows. scratch: (width) zeros. */
 void csr_products_double(int64_t count, const int64_t* one, const int64_t* other, const int32_t* start,
-                       const int32_t* columns, const double* values, double* scratch, double* out);
+                         const int32_t* columns, const double* values, double* scratch, double* out);
 
-void csr_times_float(int64_t rows, const int32_t* start, const int32_t* columns, const float* values, const float* vector,
-                    float* out);
+void csr_times_float(int64_t rows, const int32_t* start, const int32_t* columns, const float* values,
+                     const float* vector, float* out);
 void csr_matrix_float(int64_t rows, const int32_t* start, const int32_t* columns, const float* values, int64_t from,
-                     int64_t to, const float* matrix, int64_t n, float* out, int64_t stride);
+                      int64_t to, const float* matrix, int64_t n, float* out, int64_t stride);
 void csr_products_float(int64_t count, const int64_t* one, const int64_t* other, const int32_t* start,
-                       const int32_t* columns, const float* values, float* scratch, double* out);
+                        const int32_t* columns, const float* values, float* scratch, double* out);
 
 /* In place, a matrix by rows, as LAPACK's getrf leaves the transposed one. */
 void factor_double(int64_t n, double* A, int32_t* interchanged);

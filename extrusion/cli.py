@@ -246,7 +246,7 @@ def plot(folder: Path) -> None:
 
 
 @app.command()
-@click.argument("name", metavar="hard-cases", default="hard-cases")
+@click.argument("name", metavar="[hard-cases]", default="hard-cases")
 @click.option(
     "--out",
     type=PATH,
@@ -344,7 +344,7 @@ def bench(quick: bool, out: Path) -> None:
 
 
 @app.command()
-@click.argument("case", metavar="CASE|FILE.toml", default="A")
+@click.argument("case", metavar="[CASE|FILE.toml]", default="A")
 @click.option("--dim", type=int, metavar="2|3", help="Triangles or hexahedra; by default what the case needs.")
 @click.option("--size", type=float, metavar="MM", help="Element size on the billet's side; else the case's divisions.")
 @click.option(
@@ -411,7 +411,8 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
         _say(str(error))
         sys.exit(2)
     except click.exceptions.NoArgsIsHelpError as error:
-        print(error.format_message())
+        if _rank() == 0:
+            print(error.format_message())
         sys.exit(2)
     except click.ClickException as error:
         _say(error.format_message())
@@ -419,6 +420,9 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
     except KeyboardInterrupt:
         _say("interrupted")
         sys.exit(INTERRUPTED)
+    except BrokenPipeError:  # of who read the output
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except Exception as error:
         if _by_interrupt(error):  # in a callback of PETSc
             _say("interrupted")

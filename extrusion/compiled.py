@@ -1,5 +1,6 @@
-"""What is in C, contact points of curves and blocks of the compliance: compiled when first used, and kept, as DOLFINx
-compiles and keeps its forms.
+"""What is in C: contact points of curves, sums over contact points, the surface's linear algebra.
+
+Compiled when first used, and kept, as DOLFINx compiles and keeps its forms.
 """
 
 from __future__ import annotations
@@ -36,9 +37,23 @@ KINDS = {"f4": "float[]", "f8": "double[]", "i4": "int32_t[]", "i8": "int64_t[]"
 """Of NumPy's numbers in C."""
 
 
+PRELUDE = """
+#include <stdint.h>
+#include <string.h>
+#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__)
+#define WIDE __attribute__((target_clones("avx2", "default")))
+#else
+#define WIDE
+#endif
+"""
+
+
 @cache
 def library(name: str) -> ModuleType:
-    """``ray.c`` or ``blocks.c`` as a module of cffi (with ``lib`` and ``ffi``), from DOLFINx's cache of compiled forms.
+    """``{name}.c`` as a module of cffi (with ``lib`` and ``ffi``), from DOLFINx's cache of compiled forms.
+
+    Functions with REAL in their names are there twice, for float and for double; those that are WIDE are too, for
+    processors with wider registers: no sum is in another order there.
 
     Processes that find nothing there compile each for itself, and one of the results stays.
 
@@ -51,14 +66,14 @@ def library(name: str) -> ModuleType:
     options = get_options()
     arguments = [*options["cffi_extra_compile_args"], "-std=c17", "-O3", "-fno-fast-math", "-ffp-contract=off"]
     suffix = sysconfig.get_config_var("EXT_SUFFIX")
-    key = repr((header, source, arguments, cffi.__version__, suffix))
+    key = repr((PRELUDE, header, source, arguments, cffi.__version__, suffix))
     module_name = f"extrusion_{name}_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
     folder = Path(options["cache_dir"])
     path = folder / f"{module_name}{suffix}"
     if not path.exists():
         ffi = cffi.FFI()
         ffi.cdef(header)
-        ffi.set_source(module_name, f"#include <stdint.h>\n{header}{source}", extra_compile_args=arguments)
+        ffi.set_source(module_name, f"{PRELUDE}{header}{source}", extra_compile_args=arguments)
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder) as there:

@@ -721,6 +721,8 @@ class _Tangent:
     def _compile(self) -> None:
         """The ``tangent`` of ``blocks.h``, and what it points to."""
         own, others = self._blocks
+        if not {own.dtype, others.dtype} <= {None, np.dtype(self._dtype)}:
+            raise TypeError(f"blocks of {own.dtype} and {others.dtype} in a tangent of {self._dtype}")
         arrays = {
             "start": self._D.start, "columns": self._D.columns, "values": self._D.values,
             "follower": self._follower, "leader": self._two, "slope": self._slope, **self._lu,

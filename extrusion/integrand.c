@@ -1,13 +1,6 @@
 /* See `integrand.h`. */
 #include <string.h>
 
-/* Loops over rows: twice as wide where the processor can. */
-#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__linux__)
-#define WIDE __attribute__((target_clones("avx2", "default")))
-#else
-#define WIDE
-#endif
-
 void trial_stress(const integrand* of, const double* z, const double* k, double* own, double* trial)
 {
   const int64_t L = of->L, q = of->q;

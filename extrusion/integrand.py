@@ -25,6 +25,8 @@ class Integrand:
     def _fixed(self) -> dict[str, Any]:
         """What an ``integrand`` of ``integrand.h`` has of points that do not move, as arrays and numbers."""
         points, (n, q, L) = self.points, self.points.G.shape
+        if self.S is not None and self.S.shape != points.G.shape:
+            raise ValueError(f"rows of the stress, {self.S.shape}, and of the gap, {points.G.shape}")
         return _contiguous(
             {
                 "n": n, "q": q, "L": L, "facet": points.facet, "cols": points.cols, "weight": points.weight,

@@ -8,9 +8,11 @@ from __future__ import annotations
 import importlib.util
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import weakref
+from contextlib import suppress
 from pathlib import Path
 
 from extrusion import plots
@@ -29,11 +31,13 @@ class Painter:
 
     def __init__(self, ranks: int) -> None:
         self._process: subprocess.Popen[bytes] | None = None
-        if "matplotlib" in sys.modules or not available() or not ranks < (os.cpu_count() or 1):
+        if "matplotlib" in sys.modules or not available() or not sys.executable or ranks >= cores():
             return
+        # with the modules of this process, not those of the folder it is in
+        code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", __name__],
+                [sys.executable, "-c", code],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
@@ -51,10 +55,17 @@ class Painter:
         """
         process, self._process = self._process, None
         if process is not None:
-            process.communicate(pickle.dumps((record, str(folder.absolute()))))
+            with suppress(pickle.PicklingError, AttributeError, TypeError):  # a case of the user's own kind
+                process.communicate(pickle.dumps((record, str(folder.absolute()))))
             if process.returncode == 0:
                 return
+            _kill(process)
         plots.write(record, folder)
+
+
+def cores() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def available() -> bool:
@@ -65,13 +76,19 @@ def available() -> bool:
 def _end(process: subprocess.Popen[bytes]) -> None:
     """The run has come to nothing, or its pictures are drawn."""
     if process.poll() is None:
-        process.kill()
+        _kill(process)
         process.wait()
     if process.stdin is not None:
         process.stdin.close()
 
 
-def _main() -> None:
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """And the one that it has begun."""
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+
+
+def main() -> None:
     """Draw the record that comes through standard input, billet.png by one process and the rest by another."""
     from matplotlib import collections, figure  # noqa: F401  while the run is solved
     from matplotlib.backends import backend_agg  # noqa: F401
@@ -85,7 +102,3 @@ def _main() -> None:
     plots.write(record, folder, [first] if child == 0 else rest)
     status = 0 if child == 0 else os.waitpid(child, 0)[1]
     os._exit(int(status != 0))  # the interpreter would take as long to tidy up as to draw
-
-
-if __name__ == "__main__":
-    _main()

@@ -296,6 +296,23 @@ def test_verify_of_a_figure_not_reached(here: Path, capsys: Capture, monkeypatch
     assert "zone 1" in capsys.readouterr().err
 
 
+def test_help(capsys: Capture) -> None:
+    """Which arguments may be left out, with the help that a command without any gives; and a reader that has gone."""
+    assert command() == 2
+    assert "Usage: extrusion [OPTIONS] COMMAND" in capsys.readouterr().out
+    for name, argument in (("mesh", "[CASE|FILE.toml]"), ("study", "[hard-cases]"), ("run", "CASE|FILE.toml")):
+        assert command(name, "-h") == 0
+        assert f"extrusion {name} [OPTIONS] {argument}\n" in capsys.readouterr().out
+    start = [sys.executable, "-m", "extrusion", "-h"]
+    asked = subprocess.Popen(start, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert asked.stdout is not None
+    asked.stdout.close()
+    assert asked.stderr is not None
+    assert asked.stderr.read() == b""
+    assert asked.wait() == 1
+    asked.stderr.close()
+
+
 def test_plot(here: Path, capsys: Capture) -> None:
     """Pictures can be drawn from the files, if they were not wanted before."""
     pytest.importorskip("matplotlib")

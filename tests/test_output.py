@@ -212,22 +212,32 @@ def test_pictures(result: Result, folder: Path) -> None:
         result.plot("billets")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("executable", [sys.executable, "/bin/false", "/nowhere"])
+@pytest.mark.parametrize("executable", [sys.executable, "/bin/false", "/nowhere", None])
+@pytest.mark.parametrize("pickles", [True, False])
 def test_painter(
-    result: Result, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executable: str
+    result: Result,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    executable: str | None,
+    pickles: bool,
 ) -> None:
     """Another process draws the same pictures; where it fails, or cannot begin, they are drawn here."""
     pytest.importorskip("matplotlib")
     record, here = plots.Record.of(result), []
+    if not pickles:
+        record = replace(record, pressure=type("Mine", (dict,), {})(record.pressure))
     draw = plots.write
+    (tmp_path / "matplotlib.py").write_text("raise SystemExit(3)")  # not what this process would import
+    monkeypatch.chdir(tmp_path)
     with monkeypatch.context() as patch:
         patch.delitem(sys.modules, "matplotlib")
-        patch.setattr("os.cpu_count", lambda: 2)
+        patch.setattr("extrusion.painter.cores", lambda: 2)
         patch.setattr("sys.executable", executable)
         painter = Painter(1)
     monkeypatch.setattr(plots, "write", lambda *args: here.append(args) or draw(*args))
     painter.write(record, tmp_path)
-    assert bool(here) is (executable != sys.executable)
+    assert bool(here) is not (pickles and executable == sys.executable)
     for kind in plots.KINDS:
         assert (tmp_path / f"{kind}.png").read_bytes() == (folder / f"{kind}.png").read_bytes()
 
@@ -236,7 +246,7 @@ def test_painter_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """No process is begun where there is no core for it, and none outlives a run that comes to nothing."""
     pytest.importorskip("matplotlib")
     monkeypatch.delitem(sys.modules, "matplotlib")
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    monkeypatch.setattr("extrusion.painter.cores", lambda: 2)
     begun = []
     popen = subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", lambda *args, **kw: begun.append(popen(*args, **kw)) or begun[-1])
