@@ -42,7 +42,18 @@ if TYPE_CHECKING:
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
-PATH = click.Path(path_type=Path)
+
+class _Path(click.Path):
+    """A path: not nothing, nor the option after one that lacks its value."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value == "" or (isinstance(value, str) and value.startswith("-") and value != "-"):
+            name = param.opts[0] if param else ""
+            raise click.BadOptionUsage(name, f"Option {name!r} requires an argument, not {value!r}.")
+        return super().convert(value, param, ctx)
+
+
+PATH = _Path(path_type=Path)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=True)
@@ -208,8 +219,11 @@ def verify(cases: tuple[str, ...], estimates: bool, quiet: bool) -> None:
     _start()
     errors, ok = [], True
     for case in chosen:
-        with _progress(case, quiet) as observers:
-            results = result.verify(case, observers=observers)
+        with _progress(case, quiet) as observers, _Interrupt() as interrupt:
+            results = result.verify(case, observers=[*observers, interrupt])
+        if interrupt.stopped:
+            _say("interrupted")
+            sys.exit(INTERRUPTED)
         for one in results:
             if one.error:
                 errors.append(f"{case.name}: {one.error}")
@@ -259,9 +273,7 @@ def study(name: str, out: Path) -> None:
     """Run a study, or what is left of it (a quarter of an hour); writes a table as it goes, and a picture."""
     if name != "hard-cases":
         raise InputError("study", name, "the only study is hard-cases")
-    from extrusion.check import require_dolfinx
-
-    require_dolfinx()
+    _require()
     from extrusion import study as hard_cases
 
     if _rank() != 0:
@@ -286,9 +298,7 @@ def study(name: str, out: Path) -> None:
 
 
 def _verify_estimates(quiet: bool) -> None:
-    from extrusion.check import require_dolfinx
-
-    require_dolfinx()
+    _require()
     from mpi4py import MPI
 
     from extrusion.estimate import checks
@@ -323,9 +333,7 @@ def _verify_estimates(quiet: bool) -> None:
 )
 def bench(quick: bool, out: Path) -> None:
     """Measure speed against error, or what is left to measure (half an hour); writes tables and a picture."""
-    from extrusion.check import require_dolfinx
-
-    require_dolfinx()
+    _require()
     from extrusion import bench as speed
 
     if importlib.util.find_spec("matplotlib") is None:
@@ -374,9 +382,7 @@ def mesh(
             if dim == 2 and value is not None:
                 raise InputError(name, value, "leave it out, or give --dim 3 too: it is of hexahedra")
         scene = changed(scene, space="3d" if dim == 3 else None, size=size, sectors=sectors)
-    from extrusion.check import require_dolfinx
-
-    require_dolfinx()
+    _require()
     from extrusion.mesh import graded_mesh, sheet_mesh, write_mesh
     from extrusion.mesh3d import hex_mesh, write_hex
 
@@ -476,6 +482,10 @@ class _Interrupt:
             os.write(2, f"{show}extrusion: interrupted\n".encode())
         os._exit(INTERRUPTED)
 
+    def close(self) -> None:
+        """The last step has been solved: what is left are pictures."""
+        self._may_stop = False
+
     def __call__(self, problem: Problem, step: Step) -> None:
         """Stop if any rank has been told to. Collective."""
         self._may_stop = True
@@ -565,18 +575,24 @@ def _write_json(result: Result, path: Path | None) -> None:
         raise InputError("json", str(path or "-"), f"cannot be written ({error.strerror})") from None
 
 
-def _start() -> None:
-    """Load MPI and PETSc, and say so if there are more ranks on this machine than cores: MPICH busy-waits."""
+def _require() -> None:
+    """Load MPI and PETSc."""
     from extrusion.check import require_dolfinx
 
+    require_dolfinx()
+    from petsc4py import PETSc
+
+    PETSc.Sys.popSignalHandler()  # which answers a closed pipe, or `kill`, with a page
+
+
+def _start() -> None:
+    """Load MPI and PETSc, and say so if there are more ranks on this machine than cores: MPICH busy-waits."""
     with interrupted_after():
-        require_dolfinx()
+        _require()
         from mpi4py import MPI
-        from petsc4py import PETSc
 
         from extrusion import condensed, output  # noqa: F401  and with them all that a run loads
 
-    PETSc.Sys.popSignalHandler()  # which answers a closed pipe, or `kill`, with a page
     here, cores = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).size, os.cpu_count() or 1
     if here > cores:
         _say(f"{here} ranks on {cores} cores wait for one another; use at most {cores}")

@@ -823,8 +823,8 @@ def _factored(M: Array) -> dict[str, Any]:
     return {"lu": np.ascontiguousarray(lu.T), "interchanged": interchanged.astype(np.int32)}
 
 
-SMALL = 200
-"""Unknowns up to which a matrix is small."""
+SMALL = 450
+"""Unknowns up to which a matrix is small: at more the fifty times that a run factors take longer than SciPy to load."""
 
 LOOSEST = 1e-4
 """Part of the right-hand side that a solve may leave: with a hundred times more hard steps fail, and none is faster."""

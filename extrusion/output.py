@@ -81,9 +81,12 @@ class Folder:
         """Write the result, and draw it if matplotlib is there. Collective."""
         began = time.perf_counter()
 
-        def draw() -> None:
+        def keep() -> None:
             if result.snapshots is not None:
                 np.savez_compressed(self.path / "snapshots.npz", **vars(result.snapshots))
+            write()
+
+        def draw() -> None:
             if self._painter is None:
                 return
             if not available():
@@ -95,6 +98,7 @@ class Folder:
             text = json.dumps(run_record(result, options), indent=1, allow_nan=False)
             (self.path / "run.json").write_text(text + "\n", encoding="utf-8")
 
+        write_on_root(self._comm, self.path, keep)  # whatever becomes of the pictures
         write_on_root(self._comm, self.path, draw)
         result.seconds["output"] += time.perf_counter() - began
         write_on_root(self._comm, self.path, write)

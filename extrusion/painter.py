@@ -12,7 +12,8 @@ import signal
 import subprocess
 import sys
 import weakref
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from extrusion import plots
@@ -55,7 +56,8 @@ class Painter:
         """
         process, self._process = self._process, None
         if process is not None:
-            with suppress(pickle.PicklingError, AttributeError, TypeError):  # a case of the user's own kind
+            with suppress(pickle.PicklingError, AttributeError, TypeError), _no_broken_pipe():
+                # not a case of the user's own kind
                 process.communicate(pickle.dumps((record, str(folder.absolute()))))
             if process.returncode == 0:
                 return
@@ -80,6 +82,18 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
     if process.stdin is not None:
         process.stdin.close()
+
+
+@contextmanager
+def _no_broken_pipe() -> Iterator[None]:
+    """Writing to a process that has gone is no signal, by which PETSc would end this one."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGPIPE})
+    try:
+        yield
+    finally:
+        if signal.SIGPIPE in signal.sigpending():
+            signal.sigwait({signal.SIGPIPE})
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:

@@ -7,9 +7,12 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -85,6 +88,8 @@ BROKEN = {
         ("run A --size=2mm", "'--size': '2mm' is not a valid float"),
         ("mesh B --sectors 2.5", "'--sectors': '2.5' is not a valid integer"),
         ("run A --until", "--until"),
+        ("run A --out --quiet", "Option '--out' requires an argument, not '--quiet'"),
+        ("mesh A --out -", "'-': give a name that ends in .msh"),
         ("run A --die soft", "--die = 'soft'"),
         ("run A --contact welded", "--contact = 'welded'"),
         ("run A --size -1", "--size = -1.0"),
@@ -253,6 +258,41 @@ def test_interrupted_anywhere(monkeypatch: pytest.MonkeyPatch, capsys: Capture) 
     monkeypatch.setattr("extrusion.cli._load", press)
     assert command("mesh", "A") == 130
     assert capsys.readouterr().err == "extrusion: interrupted\n"
+
+
+def test_interrupted_while_drawing(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    """All steps are solved: nothing is left to stop after, and what has been written stays."""
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr("extrusion.plots.write", lambda *_: os.kill(os.getpid(), signal.SIGINT) or time.sleep(1))
+    monkeypatch.setattr("extrusion.painter.cores", lambda: 1)
+    assert command("run", "A", "--until", "10", "--quiet") == 130
+    assert capsys.readouterr().err == "extrusion: interrupted\n"
+    assert len(json.loads((here / "results/A/run.json").read_text())["steps"]) == 2
+
+
+def test_interrupted_verify(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    """The step in hand is the last one of all cases."""
+    steps = []
+
+    @contextmanager
+    def progress(*_: object) -> Iterator[list[Any]]:
+        yield [lambda problem, step: steps.append(step.t) or os.kill(os.getpid(), signal.SIGINT)]
+
+    monkeypatch.setattr(cli, "_progress", progress)
+    assert command("verify", "A", "C") == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "extrusion: interrupted"
+    assert steps == [5.0]
+
+
+def test_matplotlib_that_does_not_load(here: Path) -> None:
+    """One line; the run is kept."""
+    pytest.importorskip("matplotlib")
+    start = [sys.executable, "-m", "extrusion", "run", "A", "--until", "5", "--quiet"]
+    done = subprocess.run(start, env={**os.environ, "MPLBACKEND": "paper"}, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("extrusion: matplotlib = 'does not load': ")
+    assert len(done.stderr.splitlines()) == 1
+    assert (here / "results/A/run.json").exists()
 
 
 def test_out_of_memory(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:

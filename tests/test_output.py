@@ -2,6 +2,7 @@
 
 import csv
 import json
+import pickle
 import signal
 import subprocess
 import sys
@@ -240,6 +241,43 @@ def test_painter(
     assert bool(here) is not (pickles and executable == sys.executable)
     for kind in plots.KINDS:
         assert (tmp_path / f"{kind}.png").read_bytes() == (folder / f"{kind}.png").read_bytes()
+
+
+def test_painter_that_has_gone(result: Result, tmp_path: Path) -> None:
+    """Writing to it is a signal, by which PETSc would end this process."""
+    pytest.importorskip("matplotlib")
+    (tmp_path / "record").write_bytes(pickle.dumps(plots.Record.of(result)))
+    code = """
+import pickle, sys, time
+from mpi4py import MPI
+from petsc4py import PETSc
+from extrusion import painter
+painter.cores = lambda: 2
+python, sys.executable = sys.executable, "/bin/false"
+one = painter.Painter(1)
+sys.executable = python
+time.sleep(0.5)
+one.write(pickle.load(open("record", "rb")), painter.Path.cwd())
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert {path.name for path in tmp_path.glob("*.png")} == {f"{kind}.png" for kind in plots.KINDS}
+
+
+def test_no_half_pictures(result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is interrupted leaves the picture that was there."""
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    def fail(self: Figure, path: Path, **_: object) -> None:
+        path.write_text("half")
+        raise KeyboardInterrupt
+
+    (tmp_path / "billet.png").write_text("whole")
+    monkeypatch.setattr(Figure, "savefig", fail)
+    with pytest.raises(KeyboardInterrupt):
+        plots.write(plots.Record.of(result), tmp_path)
+    assert (tmp_path / "billet.png").read_text() == "whole"
 
 
 def test_painter_ends(monkeypatch: pytest.MonkeyPatch) -> None:
