@@ -332,7 +332,7 @@ def _verify_estimates(quiet: bool) -> None:
     help="Folder of its tables and picture.",
 )
 def bench(quick: bool, out: Path) -> None:
-    """Measure speed against error, or what is left to measure (half an hour); writes tables and a picture."""
+    """Measure speed against error, or what is left to measure (a quarter of an hour); writes tables, a picture."""
     _require()
     from extrusion import bench as speed
 
