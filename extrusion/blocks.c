@@ -1,4 +1,4 @@
-/* See `blocks.h`. Compiled for float and for double in place of REAL; WIDE: `extrusion/compiled.py`. */
+/* See `blocks.h`. Compiled for double, then for float, in place of REAL; WIDE: `extrusion/compiled.py`. */
 #include <math.h>
 #include <string.h>
 
@@ -24,20 +24,6 @@ int64_t placed(int64_t count, const int64_t* row, const int64_t* column, const d
     n += r >= 0 && c >= 0 && value[i] != 0;
   }
   return n;
-}
-
-WIDE static double product(int64_t n, const double* a, const double* b)
-{
-  double sum[lanes] = {0}, all = 0;
-  int64_t i = 0;
-  for (; i + lanes <= n; i += lanes)
-    for (int j = 0; j < lanes; ++j)
-      sum[j] += a[i + j] * b[i + j];
-  for (; i < n; ++i)
-    all += a[i] * b[i];
-  for (int j = 0; j < lanes; ++j)
-    all += sum[j];
-  return all;
 }
 
 WIDE static void add_times(int64_t n, double factor, const double* a, double* b)
@@ -264,18 +250,18 @@ int64_t gcr_REAL(const tangent* of, int64_t most, double tolerance, double* F, d
     double *z = Z + k * n, *q = Q + k * n;
     correct_REAL(of, F, z, q, scratch);
     for (int64_t j = 0; j < k; ++j)
-      along[j] = product(n, Q + j * n, q) / square[j];
+      along[j] = product_double(n, Q + j * n, q) / square[j];
     for (int64_t j = 0; j < k; ++j)
     {
       add_times(n, -along[j], Z + j * n, z);
       add_times(n, -along[j], Q + j * n, q);
     }
-    square[k] = product(n, q, q);
-    const double step = product(n, q, F) / square[k];
+    square[k] = product_double(n, q, q);
+    const double step = product_double(n, q, F) / square[k];
     add_times(n, step, z, x);
     add_times(n, -step, q, F);
     ++k;
-    if (sqrt(product(n, F, F)) <= tolerance)
+    if (sqrt(product_double(n, F, F)) <= tolerance)
       break;
   }
   return k;

@@ -62,7 +62,7 @@ def library(name: str) -> ModuleType:
     """
     header, source = (resources.files("extrusion").joinpath(f"{name}.{kind}").read_text("utf-8") for kind in "hc")
     if "REAL" in source:
-        source = "".join(source.replace("REAL", kind) for kind in ("float", "double"))
+        source = "".join(source.replace("REAL", kind) for kind in ("double", "float"))
     options = get_options()
     arguments = [*options["cffi_extra_compile_args"], "-std=c17", "-O3", "-fno-fast-math", "-ffp-contract=off"]
     suffix = sysconfig.get_config_var("EXT_SUFFIX")
