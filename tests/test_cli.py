@@ -22,6 +22,8 @@ from extrusion import cases, cli
 from extrusion.mesh import read_mesh
 from extrusion.mesh3d import read_hex
 from extrusion.newton import Newton
+from extrusion.problem import Problem
+from extrusion.stepping import Step
 
 Capture = pytest.CaptureFixture[str]
 
@@ -271,17 +273,23 @@ def test_interrupted_while_drawing(here: Path, monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_interrupted_verify(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    """The step in hand is the last one of all cases."""
-    steps = []
+    """It ends with the step in hand, and goes on to no other case."""
+    steps: list[float] = []
+
+    def press(problem: Problem, step: Step) -> None:
+        steps.append(step.t)
+        if len(steps) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
 
     @contextmanager
     def progress(*_: object) -> Iterator[list[Any]]:
-        yield [lambda problem, step: steps.append(step.t) or os.kill(os.getpid(), signal.SIGINT)]
+        yield [press]
 
     monkeypatch.setattr(cli, "_progress", progress)
     assert command("verify", "A", "C") == 130
-    assert capsys.readouterr().err.splitlines()[-1] == "extrusion: interrupted"
-    assert steps == [5.0]
+    told = capsys.readouterr().err.splitlines()
+    assert told == ["extrusion: interrupted: stops after this step (again: at once)", "extrusion: interrupted"]
+    assert steps == [5.0, 10.0, 5.0]  # the last of the same case, only checked
 
 
 def test_matplotlib_that_does_not_load(here: Path) -> None:
