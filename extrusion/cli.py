@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import atexit
 import gc
-import importlib.util
 import json
 import logging
 import os
@@ -16,7 +15,7 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, cast
@@ -54,6 +53,12 @@ class _Path(click.Path):
 
 
 PATH = _Path(path_type=Path)
+
+
+def _folder[F: Callable[..., None]](default: str) -> Callable[[F], F]:
+    """The option of a command that writes tables and a picture."""
+    told = "Folder of its tables and picture."
+    return click.option("--out", type=PATH, default=Path(default), show_default=True, metavar="DIR", help=told)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=True)
@@ -261,14 +266,7 @@ def plot(folder: Path) -> None:
 
 @app.command()
 @click.argument("name", metavar="[hard-cases]", default="hard-cases")
-@click.option(
-    "--out",
-    type=PATH,
-    default=Path("results/study"),
-    show_default=True,
-    metavar="DIR",
-    help="Folder of its table and picture.",
-)
+@_folder("results/study")
 def study(name: str, out: Path) -> None:
     """Run a study, or what is left of it (a quarter of an hour); writes a table as it goes, and a picture."""
     if name != "hard-cases":
@@ -323,20 +321,14 @@ def _verify_estimates(quiet: bool) -> None:
 
 @app.command()
 @click.option("--quick", is_flag=True, help="A small part of it, on shipped meshes: two minutes.")
-@click.option(
-    "--out",
-    type=PATH,
-    default=Path("results/bench"),
-    show_default=True,
-    metavar="DIR",
-    help="Folder of its tables and picture.",
-)
+@_folder("results/bench")
 def bench(quick: bool, out: Path) -> None:
     """Measure speed against error, or what is left to measure (a quarter of an hour); writes tables, a picture."""
     _require()
     from extrusion import bench as speed
+    from extrusion.painter import available
 
-    if importlib.util.find_spec("matplotlib") is None:
+    if not available():
         raise InputError("matplotlib", "not installed", 'pip install "extrusion[plot]"')
     if _rank() != 0:
         return
