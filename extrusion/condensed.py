@@ -784,11 +784,14 @@ class _Tangent:
 
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, y: PETSc.Vec) -> None:
         """Solve."""
-        into = y.array
-        if not self._system.on_root:
+        into, system = y.array, self._system
+        F, new = b.array_r[1:], np.zeros(0, dtype=np.int64)
+        if system.on_root:  # forces that have begun to act since the tangent was made
+            new = np.flatnonzero((F[: system.n_forces] != 0.0) & ~self._acts[: system.n_forces])
+        system.provide(new)
+        if not system.on_root:
             return
         pc.setFailedReason(PETSc.PC.FailedReason.NOERROR)
-        F = b.array_r[1:]
         x = np.where(self._acts, 0.0, F / np.where(self._acts, 1.0, self._diagonal))  # where nothing acts
         left = F - self._image(x) if x.any() else F.copy()
         norm = float(np.linalg.norm(F))

@@ -64,7 +64,8 @@ class Newton:
         self._max = max_iterations
         facet = min((float(np.median(term.pair.slave.length)) for term in problem.terms), default=np.inf)
         self._near = min(0.02 * problem.case.profile.radius, 0.5 * facet) if near is None else near
-        self._update, self._fresh, self._watched = np.inf, False, 0
+        self.tangents = 0  # made so far
+        self._begin()
         self._f = problem.x.duplicate()
         self._trial = problem.x.duplicate()
         self._trial_f = problem.x.duplicate()
@@ -85,17 +86,27 @@ class Newton:
         problem.set_solver(snes.getKSP())
         snes.setFromOptions()
         self.snes = snes
+
+    def _begin(self) -> None:
+        """Forget the last solve."""
         self.history: list[float] = []
+        self._update, self._fresh, self._watched = np.inf, False, 0
+        self._whole = False  # whether the last step was taken whole
 
     def _tangent(self, x: PETSc.Vec) -> None:
-        """Hand SNES the tangent; where its pattern has grown it is a new matrix, which the linear solve then takes."""
+        """Hand SNES the tangent: the one it has, where that will do; where the pattern has grown, a new matrix."""
+        ratio = self.history[-1] / self.history[-2] if len(self.history) > 1 else np.inf
+        # as closely as the method converges (Eisenstat, Walker, SIAM J. Sci. Comput. 17 (1996) 16,
+        # doi:10.1137/0917003)
+        self.problem.set_accuracy(self.snes.getKSP(), self.tolerance, 0.1 * ratio**2)
+        # where the last step has left a part e of the residual, another with the same tangent leaves 2 e of the rest
+        # (Kelley, Iterative Methods for Linear and Nonlinear Equations (1995) 5.4, doi:10.1137/1.9781611970944)
+        if self._whole and 2 * ratio * self.history[-1] <= self.tolerance:
+            return
+        self.tangents += 1
         near = self._update < self._near
         if near:
             self.problem.hold(x)  # each time: what has left its facet is held to the next one
-        # as closely as the method converges (Eisenstat, Walker, SIAM J. Sci. Comput. 17 (1996) 16,
-        # doi:10.1137/0917003)
-        share = 0.1 * (self.history[-1] / self.history[-2]) ** 2 if len(self.history) > 1 else np.inf
-        self.problem.set_accuracy(self.snes.getKSP(), self.tolerance, share)
         A = self.problem.tangent(x, near)
         if A != self.A:
             self._last_A, self.A = self.A, A  # SNES still looks at the old one on its way out of this call
@@ -132,7 +143,7 @@ class Newton:
             self.problem.residual(self._trial, self._trial_f)
         if best not in (0.0, 1.0):
             y.scale(best)
-        self._fresh = best > 0.0
+        self._fresh, self._whole = best > 0.0, best == 1.0
         self._update = self.problem.largest_displacement(y)
         return best != 1.0
 
@@ -160,7 +171,7 @@ class Newton:
             share: End at this part of the first residual.
         """
         self._limit, self._share = self._max if at_most is None else min(at_most, self._max), share
-        self.history, self._update, self._fresh, self._watched = [], np.inf, False, 0
+        self._begin()
         self.problem.hold(None)
         self.tolerance = max(self.atol, self.problem.round_off(x))
         self.problem.set_accuracy(self.snes.getKSP(), self.tolerance, PREDICTED)
@@ -188,6 +199,7 @@ class Newton:
             self.problem.expect(None)
             return 0
         A = self.problem.tangent(x, False)
+        self.tangents += 1
         ksp.setOperators(A)
         ksp.solve(f, y)
         self.problem.expect(None)

@@ -153,7 +153,7 @@ class History(_Table):
         row: dict[str, object] = {"t": step.t}
         for name, (u_r, u_y) in step.points.items():
             row |= {f"u_r_{name}": u_r, f"u_y_{name}": u_y}
-        for key in ("reaction", "die_reaction", "energy", "iterations", "passes", "cuts", "residual"):
+        for key in ("reaction", "die_reaction", "energy", "iterations", "tangents", "passes", "cuts", "residual"):
             row[key] = getattr(step, key)
         row |= {f"gap_{name}": gap for name, gap in step.gap.items()}
         self._write(problem.comm, list(row), [list(row.values())])

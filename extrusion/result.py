@@ -165,6 +165,7 @@ class Result:
                     "reaction": _finite(step.reaction),
                     "energy": _finite(step.energy),
                     "iterations": step.iterations,
+                    "tangents": step.tangents,
                     "cuts": step.cuts,
                     "gap": {name: _finite(value) for name, value in step.gap.items()},
                 }

@@ -76,6 +76,7 @@ class Step:
     die_reaction: float  # axial force of the die's supports on the die, N, whole revolution
     energy: float  # elastic energy, N mm
     iterations: int  # linear solves, over all passes and cuts
+    tangents: int  # how many of these were with a new tangent
     passes: int  # geometry passes of the accepted increment
     cuts: int
     residual: float  # N
@@ -110,6 +111,7 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
     problem.shift_billet(rate, 1.0)  # du/dt that predicts the next increment: rigid at first, then that of the last one
     for target in times:
         cuts = iterations = passes = 0
+        tangents = newton.tangents
         dt = target - t
         least = dt / 2**MAX_CUTS
         while t < target:
@@ -155,6 +157,7 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
             die_reaction=die,
             energy=problem.energy(x),
             iterations=iterations,
+            tangents=newton.tangents - tangents,
             passes=passes,
             cuts=cuts,
             residual=outcome.residual,

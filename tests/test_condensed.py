@@ -159,6 +159,53 @@ def test_prediction_saves_iterations() -> None:
     assert with_ < 0.8 * without
 
 
+class Anew(Newton):
+    """Makes a tangent for every linear solve."""
+
+    _whole = property(lambda self: False, lambda self, whole: None)
+
+
+@pytest.mark.parametrize("surface", [True, False])
+def test_the_last_solve_needs_no_tangent(surface: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One is made though another solve with the last would do; one serves where it does not, which costs solves."""
+    problem = scene(replace(UNILATERAL, size=4.0))
+    system: System = Condensed(problem) if surface else problem
+    times, made = list(np.arange(5.0, 61.0, 5.0)), []
+    tangent = system.tangent
+    monkeypatch.setattr(system, "tangent", lambda *of: made.append(1) or tangent(*of))
+    found = list(steps(system, Newton(system), times))
+    assert sum(step.tangents for step in found) == len(made)
+    anew = list(steps(system, Anew(system), times))
+    assert [step.tangents for step in anew] == [step.iterations for step in anew]
+    assert sum(step.tangents for step in found) <= 0.95 * sum(step.tangents for step in anew)
+    assert sum(step.iterations for step in found) <= 1.02 * sum(step.iterations for step in anew)
+    for one, other in zip(found, anew, strict=True):
+        assert one.points["K"] == pytest.approx(other.points["K"], abs=1e-9)
+        assert one.reaction == pytest.approx(other.reaction, abs=1e-3)
+
+
+@pytest.mark.mpi
+def test_a_force_that_begins_to_act() -> None:
+    """A tangent serves again, where another point has closed: what its force displaces has not been asked for yet."""
+    system = Condensed(scene(replace(UNILATERAL, size=1.0), MPI.COMM_WORLD))
+    newton = Newton(system)
+    for _ in steps(system, newton, [5.0]):
+        pass
+    f, y = system.x.duplicate(), system.x.duplicate()
+    ksp = newton.snes.getKSP()
+    ksp.setOperators(system.tangent(system.x, False))
+    new = -1
+    if system.on_root:
+        die = system.of_body[1]
+        new = die.start + next(i for i in range(die.stop - die.start) if system.C[1].missing(np.array([i])))
+        f.array[1 + new] = 1.0
+    f.assemble()
+    ksp.solve(f, y)
+    if system.on_root:
+        assert y.array_r[1 + new] == pytest.approx(-1.0)
+        assert np.abs(system.displacements(np.eye(1, system.n_forces, new)[0])).max() > 0.0
+
+
 @pytest.mark.parametrize(("theta", "closely"), [(0, False), (-1, True)])
 def test_no_closer_than_needed(theta: int, closely: bool) -> None:
     """A linear solve leaves as much as Newton's method may, but for the methods that cannot do with less."""

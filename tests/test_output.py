@@ -55,7 +55,7 @@ def test_history(result: Result, folder: Path) -> None:
     for name in ("t", "reaction", "energy", "iterations"):
         np.testing.assert_array_equal(history[name], getattr(result, name))
     np.testing.assert_array_equal(history["gap_L"], result.gap("L"))
-    for name in ("die_reaction", "passes", "cuts", "residual"):
+    for name in ("die_reaction", "tangents", "passes", "cuts", "residual"):
         np.testing.assert_array_equal(history[name], [getattr(step, name) for step in result.steps])
 
 

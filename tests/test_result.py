@@ -68,7 +68,7 @@ def test_json(result: Result) -> None:
     assert " ".join(data) == keys
     assert list(data["seconds"]) == ["setup", "solve", "output", "factor", "condensation", "pairing"]
     step, last = data["steps"][-1], result.steps[-1]
-    assert " ".join(step) == "t points reaction energy iterations cuts gap"
+    assert " ".join(step) == "t points reaction energy iterations tangents cuts gap"
     assert step["points"]["K"] == list(last.points["K"])
     assert {"K", "L", "M"} <= set(step["points"])
     assert {"L", "M"} <= set(step["gap"])
