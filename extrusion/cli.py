@@ -7,12 +7,14 @@ by the commands that need it, so that help and lists are quick.
 from __future__ import annotations
 
 import atexit
+import errno
 import gc
 import json
 import logging
 import os
 import signal
 import sys
+import tempfile
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -402,6 +404,7 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
     try:
         with app.make_context("extrusion", [*(sys.argv[1:] if args is None else args)]) as context:
             app.invoke(context)
+        sys.stdout.flush()
         sys.exit(0)
     except click.exceptions.Exit as done:  # after help, or the version
         sys.exit(done.exit_code)
@@ -418,26 +421,34 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
     except KeyboardInterrupt:
         _say("interrupted")
         sys.exit(INTERRUPTED)
-    except BrokenPipeError:  # of who read the output
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        if error.errno not in (errno.EPIPE, errno.ENOSPC):  # who read the output has left, or has no room
+            _unexpected(error)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # which is flushed at the end
+        _say("" if error.errno == errno.EPIPE else f"{error.filename or 'output'}: {error.strerror}")
         sys.exit(1)
     except Exception as error:
-        if _by_interrupt(error):  # in a callback of PETSc
-            _say("interrupted")
-            sys.exit(INTERRUPTED)
-        MPI = getattr(sys.modules.get("mpi4py.MPI"), "COMM_WORLD", None)
-        if isinstance(error, MemoryError) or "Out of memory" in str(error):
-            _say("out of memory: take a coarser mesh, order 1, or in 3D --solver iterative")
-            if MPI is None or MPI.size == 1:
-                sys.exit(1)
-            sys.stderr.flush()
-            MPI.Abort(1)
+        _unexpected(error)
+
+
+def _unexpected(error: Exception) -> NoReturn:
+    """End by what no command has foreseen."""
+    if _by_interrupt(error):  # in a callback of PETSc
+        _say("interrupted")
+        sys.exit(INTERRUPTED)
+    MPI = getattr(sys.modules.get("mpi4py.MPI"), "COMM_WORLD", None)
+    if isinstance(error, MemoryError) or "Out of memory" in str(error):
+        _say("out of memory: take a coarser mesh, order 1, or in 3D --solver iterative")
         if MPI is None or MPI.size == 1:
-            raise
-        traceback.print_exc()
+            sys.exit(1)
         sys.stderr.flush()
         MPI.Abort(1)
-        raise
+    if MPI is None or MPI.size == 1:
+        raise error
+    traceback.print_exc()
+    sys.stderr.flush()
+    MPI.Abort(1)
+    raise error
 
 
 class _Interrupt:
@@ -530,7 +541,7 @@ def _as_options(given: set[str]) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        name = error.field.rsplit(".", 1)[-1]
+        name = "until" if error.field == "increments" and "until" in given else error.field.rsplit(".", 1)[-1]
         if name not in given or ": " in error.field:
             raise
         raise InputError(f"--{name}", error.value, error.remedy) from None
@@ -541,8 +552,13 @@ def _check_writable(field: str, path: Path) -> None:
     folder = path.parent
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
-    if path.is_dir() or not folder.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
-        raise InputError(field, str(path), "cannot be written; give another file")
+    try:
+        if path.is_file() or path.is_dir():
+            path.open("a").close()
+        elif not path.exists():  # nor a pipe, whose reader would see it closed
+            tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise InputError(field, str(path), f"cannot be written ({error.strerror}); give another file") from None
 
 
 @contextmanager

@@ -381,6 +381,8 @@ def run(
         if goal not in GOALS:
             raise InputError("goal", goal, f"choose one of {', '.join(GOALS)}")
     comm = MPI.COMM_WORLD if comm is None else comm
+    if out is not None and not isinstance(out, str | Path):
+        raise InputError("out", out, "give a folder")
     if mesh is not None and not isinstance(mesh, str | Path) and not hasattr(mesh, "cells"):
         raise InputError("mesh", mesh, "give a mesh file, or what extrusion.mesh makes")
     given = str(mesh) if isinstance(mesh, str | Path) else None
@@ -389,7 +391,7 @@ def run(
     top = max(y for _, _, y in case.profile.die)
     if case.end > top and any(zone.contact != "check" for zone in case.zones):
         remedy = f"end before the rear face leaves the die, which ends at y = {top:g} mm"
-        raise InputError("increments", case.end, remedy)
+        raise InputError("increments" if changes.get("until") is None else "until", case.end, remedy)
     if solver == "iterative" and (case.space != "3d" or case.mixed):
         why = f"the displacement form (at nu = {case.billet.nu:g} mixed)" if case.space == "3d" else "space = '3d'"
         raise InputError("solver", solver, f"is for {why}: choose surface, full or auto")

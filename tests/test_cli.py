@@ -104,7 +104,7 @@ BROKEN = {
         ("run A --increment 0", "--increment = 0.0"),
         ("run A --until 0", "--until = 0.0"),
         ("run A --until 156", "--until = 156.0"),
-        ("run A --until 500 --increment 50", "increments = 500.0: end before the rear face leaves the die"),
+        ("run A --until 500 --increment 50", "--until = 500.0: end before the rear face leaves the die"),
         ("run A --increment 1e-6", "--increment = 1e-06: give a longer one: at most 100000"),
         ("run A --theta 1", "--theta = 1: leave it out: it is a variant of method = 'nitsche'"),
         ("verify between.toml", "figures.t = 7.0: no increment of case A ends there"),
@@ -112,6 +112,8 @@ BROKEN = {
         ("run A --theta -2", "--theta = -2"),
         ("run A --out mesh.txt", "--out = 'mesh.txt': cannot be written"),
         ("run A --json mesh.txt/a.json", "--json = 'mesh.txt/a.json'"),
+        ("run A --json /proc/a.json", "--json = '/proc/a.json': cannot be written"),
+        ("run A --json /proc/version", "--json = '/proc/version': cannot be written"),
         ("run A --bogus", "--bogus"),
         ("verify short.toml", "short.toml: increments"),
         ("verify A Z", "CASE = 'Z'"),
@@ -426,6 +428,19 @@ def test_tolerance_in_space(here: Path, caplog: pytest.LogCaptureFixture) -> Non
     data = json.loads((here / "b.json").read_text())
     assert data["estimate"]["parts"][0]["name"] == "axisymmetry instead of three dimensions"
     assert 'space = "axisymmetric"' in json.loads((here / "results/B/run.json").read_text())["toml"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("args", ["list", "--version", "run --help"])
+def test_full_output(args: str, unbuffered: str) -> None:
+    """One line, whether it is told when it is written or when all is flushed."""
+    start = [sys.executable, "-m", "extrusion", *args.split()]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            start, stdout=full, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": unbuffered}
+        )
+    assert (done.returncode, done.stderr) == (1, "extrusion: output: No space left on device\n")
 
 
 def test_list_and_version(capsys: Capture) -> None:

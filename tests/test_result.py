@@ -183,8 +183,9 @@ def test_ranks_do_not_matter() -> None:
         ({"mesh": bundled(cases.A.profile), "space": "3d"}, "mesh = '2-dimensional points': give a HexMesh"),
         ({"zones": ("x",)}, "zones = 'x': give each as"),
         ({"order": 2, "form": "mixed", "billet": Elastic(5000, 0.0)}, "form = 'mixed': the pressure is divided by nu"),
-        ({"until": 240.0, "increment": 60.0}, "increments = 240.0: end before the rear face leaves the die"),
+        ({"until": 240.0, "increment": 60.0}, "until = 240.0: end before the rear face leaves the die"),
         ({"mesh": 3}, "mesh = 3: give a mesh file"),
+        ({"out": 3}, "out = 3: give a folder"),
     ],
 )
 def test_bad_options(options: dict[str, Any], told: str) -> None:
