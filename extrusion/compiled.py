@@ -18,7 +18,9 @@ from typing import Any
 
 from mpi4py import MPI  # noqa: F401  the wheel's DOLFINx needs the MPI that it loads
 
+import _cffi_backend
 import cffi
+import numpy as np
 from numpy.typing import NDArray
 
 from dolfinx.jit import get_options
@@ -28,12 +30,16 @@ from extrusion.errors import InputError
 
 def pointer(array: NDArray[Any]) -> Any:
     """C's pointer to a contiguous array's numbers, which must outlive it."""
-    return FFI.from_buffer(KINDS[array.dtype.str[1:]], array)
+    return FFI.from_buffer(KINDS[array.dtype], array)
 
 
-FFI = cffi.FFI()
+FFI: Any = _cffi_backend.FFI()
+"""As compiled modules have it, in C: what cffi.FFI does in Python takes as long as a small sum."""
 
-KINDS = {"f4": "float[]", "f8": "double[]", "i4": "int32_t[]", "i8": "int64_t[]", "b1": "int8_t[]"}
+KINDS = {
+    np.dtype(name): FFI.typeof(f"{kind}[]")
+    for name, kind in (("f4", "float"), ("f8", "double"), ("i4", "int32_t"), ("i8", "int64_t"), ("?", "int8_t"))
+}
 """Of NumPy's numbers in C."""
 
 

@@ -224,7 +224,10 @@ def _linked(A: Array, rows: Index, links: tuple[Index, Index, Array] | None) -> 
     """Rows of a matrix; see `Block.part`."""
     out = A[rows]
     to, of, slope = links or (rows[:0], rows[:0], A[0, :0])
-    while len(to):  # one at each row at a time: three forces of a node may be two links
+    while len(to) and A.shape[1]:  # one at each row at a time: three forces of a node may be two links
+        if (to[1:] > to[:-1]).all():
+            out[to] += slope[:, None] * A[of]
+            break
         first = np.unique(to, return_index=True)[1]
         out[to[first]] += slope[first, None] * A[of[first]]
         rest = np.delete(np.arange(len(to)), first)

@@ -150,7 +150,7 @@ class Condensed(System):
         size = 1 + self.n_forces + self.n_multipliers
         self.x = PETSc.Vec().createMPI((size if self.on_root else 0, size), comm=self.comm)
         self._tangent = _Tangent(self)
-        self._known: list[tuple[Array, Array, Array]] = []  # x, -C f at all rows, z
+        self._known: list[tuple[bytes, Array, Array]] = []  # x, -C f at all rows, z
         self._placed = 0.0  # 1 once the billet is where it stands at the start
         n = self.x.local_size
         self._A = PETSc.Mat().createPython(((n, size), (n, size)), context=self._tangent, comm=self.comm)
@@ -334,15 +334,16 @@ class Condensed(System):
 
     def _at(self, x: PETSc.Vec) -> tuple[Array, Array]:
         """-C f at all rows, and the contact vector; on rank 0. The last two are remembered."""
+        at = x.array_r.tobytes()
         for known, u, z in self._known:
-            if np.array_equal(known, x.array_r):
+            if known == at:
                 return u, z
         t, f, multipliers = self._split(x)
         u = self.displacements(f)
         z = t * self._z_drive + self._z_start * self._placed
         z[self._z_of] += u[self._in_z]
         z[self.n_z - self.n_multipliers :] = multipliers
-        self._known = [(np.array(x.array_r), u, z), *self._known[:1]]
+        self._known = [(at, u, z), *self._known[:1]]
         return u, z
 
     def gather(self, x: PETSc.Vec) -> Array:
@@ -361,7 +362,8 @@ class Condensed(System):
     def largest_displacement(self, x: PETSc.Vec) -> float:
         largest = 0.0
         if self.on_root:
-            if len(self._known) == 2 and np.array_equal(self._known[1][0] - x.array_r, self._known[0][0]):
+            known = [np.frombuffer(at) for at, _, _ in self._known]
+            if len(known) == 2 and np.array_equal(known[1] - x.array_r, known[0]):
                 u = (self._known[1][2] - self._known[0][2])[self._z_of]  # x is the step between the last two
             else:
                 t, f, _ = self._split(x)
@@ -592,6 +594,8 @@ class _Tangent:
         self.set_accuracy(0.0, 0.0)
         # of each body, which forces have a part in the solve, and the rows of C that are read
         self._held = [(np.zeros(C.shape[0], dtype=bool), slice(0, 0)) for C in system.C]
+        self._cols: Index = np.zeros(0, dtype=np.int64)  # of D, what each column is, of all that is read
+        self._col = np.zeros(0, dtype=np.int32)  # and where each of these stands
         self._pressed = np.zeros(system.n_multipliers, dtype=bool)  # multipliers that have a part in the solve
         self.forget()
 
@@ -641,6 +645,8 @@ class _Tangent:
     def _hold(self, D: Triplets) -> None:
         """C, and the multipliers, for all that acts and all that is read; if some has not been so, factor anew."""
         system, n_f = self._system, self._system.n_forces
+        if self._lu is not None and not self._acts[self._row < 0].any() and (self._col[D.cols] >= 0).all():
+            return
         read = np.zeros(system.n_read + system.n_multipliers, dtype=bool)
         read[D.cols] = True
         same = self._lu is not None  # increment: what has been involved may be so again

@@ -80,6 +80,17 @@ class Surface:
         K = np.linalg.inv(np.swapaxes(self.cell_X[:, 1:] - self.cell_X[:, :1], 1, 2))  # K[m, i, j] = d X_i(ref) / d x_j
         return np.einsum("ak,imkl,mij->malj", SHAPES[k][:-1, 0], table, K)
 
+    def least(self, z: Array, axis: int, sign: float) -> float:
+        """Smallest value of ``sign`` times a component of the current position of nodes, mm."""
+        X, entries = self._along[axis]
+        return float((sign * (X + z[entries])).min())
+
+    @cached_property
+    def _along(self) -> list[tuple[Array, Index]]:
+        """Each component of the nodes' positions, and where z holds its displacement."""
+        X, nodes = self.node_positions, self.node_numbers
+        return [(np.ascontiguousarray(X[:, axis]), 2 * nodes + axis) for axis in (0, 1)]
+
     @cached_property
     def _last_node(self) -> int:
         return int(max(self.nodes.max(), self.cell_nodes.max()))
@@ -269,10 +280,7 @@ def ray_points(
 
 def least_gap(slave: Surface, die: Surface, z: Array, axis: int, sign: float) -> float:
     """A lower bound of the ray gap anywhere, from the extent of both surfaces along the ray, mm (nodes)."""
-    u = z.reshape(-1, 2)
-    x_s = slave.X[..., axis] + u[slave.nodes, axis]
-    x_d = die.X[..., axis] + u[die.nodes, axis]
-    return float(np.min(sign * x_d) - np.max(sign * x_s))
+    return die.least(z, axis, sign) + slave.least(z, axis, -sign)
 
 
 def _reference_slope(die: Surface, axis: int) -> Array:
@@ -316,13 +324,16 @@ def stress_rows(
     if slave.tabulate is None:
         raise ValueError("the surface has no cells behind it")
     facet, xi = np.ascontiguousarray(facet, dtype=np.int64), np.ascontiguousarray(xi)
-    d = np.broadcast_to(np.asarray(direction, dtype=np.float64), (n, q, 2))
-    if d.strides[2] != d.itemsize:
+    d = np.asarray(direction, dtype=np.float64)
+    if d.ndim > 1:
+        d = np.broadcast_to(d, (n, q, 2))
+    if d.strides[-1] != d.itemsize:
         d = np.ascontiguousarray(d)
+    strides = [i // d.itemsize for i in d.strides[:-1]] or [0, 0]
     strided = ray().ffi.cast("double *", d.ctypes.data)
     rows = np.zeros((n, q, 2 * K + between + 3 * mixed))
     ray().lib.stress_rows(
-        slave._compiled[0], n, q, pointer(facet), pointer(xi), strided, *(i // d.itemsize for i in d.strides[:2]),
+        slave._compiled[0], n, q, pointer(facet), pointer(xi), strided, *strides,
         lmbda, mu, axisymmetric, derivative, rows.shape[2], 2 * K + between if mixed else -1, pointer(rows),
     )  # fmt: skip
     return rows

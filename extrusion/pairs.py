@@ -390,7 +390,7 @@ class CurvePair(Pair):
         return np.append(at[:, 0], at[-1:, 1])
 
     def least_gap(self, z: Array) -> float:
-        return least_gap(self.slave, self.die, _even(z), self.axis, self.sign)
+        return least_gap(self.slave, self.die, z, self.axis, self.sign)
 
 
 def _even(z: Array) -> Array:
