@@ -115,6 +115,8 @@ class Blocks:
             to.width = part.near.stop + part.after.shape[1]
             to.before, to.after = len(part.before), len(part.after)
             for name, given in zip("DUVW", (part.D, part.U, part.before, part.after), strict=True):
+                if not given.size:
+                    continue
                 # some run down their columns
                 array = given if given.strides[1] == given.itemsize else np.ascontiguousarray(given)
                 self._held.append(array)

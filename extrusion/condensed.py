@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import math
 import os
 import time
 import weakref
@@ -449,22 +450,20 @@ class Condensed(System):
 
     # -- reports ---------------------------------------------------------------------------------------------
 
-    def reactions(self, x: PETSc.Vec) -> tuple[float, float]:
-        R = self.contact_forces(self.gather(x))
+    def balance(self, x: PETSc.Vec) -> tuple[float, float, float]:
+        z = self.gather(x)
+        R = self.contact_forces(z)
         rear, die = float(R[self._z_y[0]].sum()), float(R[self._z_y[1]].sum())
         if self.case.die == "rigid":
             die = -rear
-        return self.full.copies * rear, self.full.copies * die
-
-    def energy(self, x: PETSc.Vec) -> float:
-        # half of the supports' work less that of the forces on the rest, which are -R
-        z = self.gather(x)
-        R = self.contact_forces(z)
+        # the energy: half of the supports' work less that of the forces on the rest, which are -R
         free = self.full.z_free.copy()
         free[self.n_z - self.n_multipliers :] = False
         at_rear = R[self._z_y[0] & free].sum()  # K u there
         at_planes = self._placed * (self._z_start[free] @ R[free])
-        return 0.5 * self.full.copies * float(self._time(x) * at_rear + at_planes - z[free] @ R[free])
+        energy = 0.5 * float(self._time(x) * at_rear + at_planes - z[free] @ R[free])
+        copies = self.full.copies
+        return copies * rear, copies * die, copies * energy
 
     def named_points(self) -> dict[str, tuple[int, int]]:
         return self._watch
@@ -800,10 +799,9 @@ class _Tangent:
         pc.setFailedReason(PETSc.PC.FailedReason.NOERROR)
         x = np.where(self._acts, 0.0, F / np.where(self._acts, 1.0, self._diagonal))  # where nothing acts
         left = F - self._image(x) if x.any() else F.copy()
-        norm = float(np.linalg.norm(F))
-        tolerance = max(self._share * norm, self._rest)
+        tolerance = max(self._share * math.sqrt(F @ F), self._rest)
         turn = 0
-        while np.linalg.norm(left[self._entries]) > tolerance:
+        while math.sqrt((rest := left[self._entries]) @ rest) > tolerance:
             if turn == 1 and not self._fresh:
                 self._factor(self.PARALLEL)
             if turn == 3:
@@ -811,7 +809,7 @@ class _Tangent:
             if turn == 4:
                 pc.setFailedReason(PETSc.PC.FailedReason.SUBPC_ERROR)
                 break
-            rest = left[self._entries]
+            rest = left[self._entries]  # a factorisation has them in another order
             x[self._entries] += self._improve(rest, tolerance)
             left[self._entries] = rest
             turn += 1

@@ -101,6 +101,10 @@ class Pair(ABC):
         ``keep`` are facets of an earlier pairing to stay with (`closest_points`).
         """
 
+    def gaps(self, z: Array, which: Index) -> Array:
+        """The gap at some of the slave's nodes, mm."""
+        return self.at_nodes(z, which=which).gap
+
     @abstractmethod
     def nodal_weights(self) -> Array:
         """Integral of each node's shape function over the reference surface, mm^2 (or mm), in the nodes' order."""
@@ -248,6 +252,12 @@ class CurvePair(Pair):
         ones = np.ones((len(x), 1))
         found, gap, G, cols = closest_rows(nodes[:, None], ones, x, self.die, _even(z), self.smooth, keep)
         return NodeRows(gap, G, cols, found.past, np.abs(found.normal @ self.direction), found.facet)
+
+    def gaps(self, z: Array, which: Index) -> Array:
+        if not self.ray:
+            return super().gaps(z, which)
+        x = self.X[which] + self.displacement(z, self.nodes[which])
+        return ray_gap(x, self.die, _even(z), self.axis, self.sign)[0]
 
     def _ray_rows(self, nodes: Index, x: Array, z: Array) -> NodeRows:
         p, c, sign, die = 1 - self.axis, self.axis, self.sign, self.die

@@ -686,32 +686,23 @@ class Problem(System):
 
     # -- reports ---------------------------------------------------------------------------------------------
 
-    def reactions(self, x: PETSc.Vec) -> tuple[float, float]:
-        """Axial force of the rear face on the billet, and of the die's supports on the die, N, whole revolution.
-
-        Both are positive in +y; they balance. A rigid die is its own support.
-        """
-        f = self.forces(x)
+    def balance(self, x: PETSc.Vec) -> tuple[float, float, float]:
+        f = self._K_wide.createVecLeft()
+        self._K_wide.mult(x, f)
+        energy = 0.5 * float(x.dot(f))
+        f.array[self._x_mine] += self.contact_forces(self.gather(x))[self._z_mine]
         rear, die = float(f.array_r[self._driven].sum()), float(f.array_r[self._clamped_y].sum())
         f.destroy()
         rear, die = self.comm.allreduce(rear), self.comm.allreduce(die)
         if self.case.die == "rigid":
             die = self.rigid_die_reaction(self.gather(x))
-        return self.copies * rear, self.copies * die
+        return self.copies * rear, self.copies * die, self.copies * energy
 
     def rigid_die_reaction(self, z: Array) -> float:
         """Axial force of the supports on a rigid die, N: minus that of contact on the billet."""
         axial = np.zeros(self.n_z, dtype=bool)
         axial[1 : self.dim * len(self._live) : self.dim] = True
         return -float(self.contact_forces(z)[axial].sum())
-
-    def energy(self, x: PETSc.Vec) -> float:
-        """Elastic energy of both bodies, N mm, whole revolution."""
-        f = self._K_wide.createVecLeft()
-        self._K_wide.mult(x, f)
-        energy = 0.5 * float(x.dot(f))
-        f.destroy()
-        return self.copies * energy
 
     def named_points(self) -> dict[str, tuple[int, int]]:
         """Rank and local dof block of each named point of the profile that is a node of the mesh."""

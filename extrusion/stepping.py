@@ -149,13 +149,13 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
                     f"{outcome.remedy or _remedy(problem.case)}"
                 )
             log.info("t = %.6g mm: %s; %s; cut to %.3g mm", goal, outcome.reason, place, dt)
-        rear, die = problem.reactions(x)
+        rear, die, energy = problem.balance(x)
         yield Step(
             t=t,
             points=problem.point_displacements(x, points),
             reaction=rear,
             die_reaction=die,
-            energy=problem.energy(x),
+            energy=energy,
             iterations=iterations,
             tangents=newton.tangents - tangents,
             passes=passes,

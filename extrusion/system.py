@@ -220,15 +220,12 @@ class System(ABC):
     # -- reports ---------------------------------------------------------------------------------------------
 
     @abstractmethod
-    def reactions(self, x: PETSc.Vec) -> tuple[float, float]:
-        """Axial force of the rear face on the billet, and of the die's supports on the die, N, whole revolution.
+    def balance(self, x: PETSc.Vec) -> tuple[float, float, float]:
+        """Axial force of the rear face on the billet, that of the die's supports on the die, N, and the energy, N mm.
 
-        Both are positive in +y; they balance. A rigid die is its own support.
+        Of the whole revolution. The forces are positive in +y; they balance. A rigid die is its own support. The energy
+        is the elastic one of both bodies.
         """
-
-    @abstractmethod
-    def energy(self, x: PETSc.Vec) -> float:
-        """Elastic energy of both bodies, N mm, whole revolution."""
 
     @abstractmethod
     def named_points(self) -> dict[str, tuple[int, int]]:
@@ -248,7 +245,7 @@ class System(ABC):
         out: dict[str, float] = {}
         for term, corners in zip(self.terms, self._corners, strict=True):
             if corners:
-                gaps = term.pair.at_nodes(z, which=np.array([*corners.values()])).gap
+                gaps = term.pair.gaps(z, np.array([*corners.values()]))
                 out.update(zip(corners, gaps.tolist(), strict=True))
         return out
 

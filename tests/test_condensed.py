@@ -75,7 +75,7 @@ def test_two_ranks_are_one(name: str) -> None:
     for comm in (MPI.COMM_WORLD, MPI.COMM_SELF):
         problem = scene(SCENES[name], comm)
         rows, _ = reported(Condensed(problem), [5.0, 20.0, 40.0])
-        ends.append((rows, problem.reactions(problem.x) if comm is MPI.COMM_SELF else None))
+        ends.append((rows, problem.balance(problem.x) if comm is MPI.COMM_SELF else None))
     np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=0, atol=1e-9)
 
 

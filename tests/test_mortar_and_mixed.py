@@ -62,7 +62,7 @@ def test_uniform_state_between_E_and_F(form: str) -> None:
     state = problem.terms[0].state(problem.gather(problem.x))
     np.testing.assert_allclose(state.ray_pressure, 5000 * 2 / (0.55 * 50), rtol=1e-8)
     assert pytest.approx(65 * 0.9 * 2 / (0.55 * 50), abs=1e-9) == K - 135.2
-    assert abs(problem.reactions(problem.x)[0]) < 1e-3
+    assert abs(problem.balance(problem.x)[0]) < 1e-3
 
 
 def test_forms_agree_at_moderate_nu() -> None:
