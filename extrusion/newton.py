@@ -101,7 +101,7 @@ class Newton:
         self.problem.set_accuracy(self.snes.getKSP(), self.tolerance, 0.1 * ratio**2)
         # where the last step has left a part e of the residual, another with the same tangent leaves 2 e of the rest
         # (Kelley, Iterative Methods for Linear and Nonlinear Equations (1995) 5.4, doi:10.1137/1.9781611970944)
-        if self._whole and 2 * ratio * self.history[-1] <= self.tolerance:
+        if self.problem.keeps_tangents and self._whole and 2 * ratio * self.history[-1] <= self.tolerance:
             return
         self.tangents += 1
         near = self._update < self._near

@@ -521,6 +521,11 @@ class Problem(System):
             ksp.setTolerances(rtol=rtol, atol=0.3 * tolerance, max_it=400)
 
     @property
+    def keeps_tangents(self) -> bool:
+        """Not where all is factored anew for each: that is the plain method, which the others are checked against."""
+        return self._krylov is not None
+
+    @property
     def iterates(self) -> bool:
         """Whether it does as `iterate` says."""
         return self._krylov is not None

@@ -95,6 +95,11 @@ class System(ABC):
         case = self.case
         return case.method == "nodal" or (case.method == "nitsche" and case.theta != 0)
 
+    @property
+    def keeps_tangents(self) -> bool:
+        """Whether Newton's method may solve with a tangent again."""
+        return True
+
     def forget_pattern(self) -> None:  # noqa: B027
         """Let go of the contact pairs met so far, if they cost anything."""
 
