@@ -1,7 +1,7 @@
 """The command ``extrusion``.
 
-Exit codes: 0 done, 1 a step could not be solved or a figure is out, 2 bad input, 130 interrupted. DOLFINx is imported
-by the commands that need it, so that help and lists are quick.
+Exit codes: 0 done, 1 a step could not be solved, a figure is out or a disk is full, 2 bad input, 130 interrupted.
+DOLFINx is imported by the commands that need it, so that help and lists are quick.
 """
 
 from __future__ import annotations
@@ -402,33 +402,42 @@ def main(args: Sequence[str] | None = None) -> NoReturn:
     """
     atexit.register(gc.freeze)  # the interpreter would look for cycles in all that is left, for a third of a second
     try:
-        with app.make_context("extrusion", [*(sys.argv[1:] if args is None else args)]) as context:
+        code = _invoke([*(sys.argv[1:] if args is None else args)])
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as error:
+        full = error.errno == errno.ENOSPC and _ranks() == 1
+        if not (full or isinstance(error, BrokenPipeError)):  # who read the output has left
+            _unexpected(error)
+        code = 1
+        if full:
+            _say(f"{error.strerror} for {error.filename or 'the output, or for compiled forms'}")
+        if sys.stdout is not None:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # it is flushed at the end
+    except Exception as error:
+        _unexpected(error)
+    sys.exit(code)
+
+
+def _invoke(args: list[str]) -> int:
+    """Run the command line; its exit code."""
+    try:
+        with app.make_context("extrusion", args) as context:
             app.invoke(context)
-        sys.stdout.flush()
-        sys.exit(0)
+        return 0
     except click.exceptions.Exit as done:  # after help, or the version
-        sys.exit(done.exit_code)
+        return done.exit_code
     except InputError as error:
         _say(str(error))
-        sys.exit(2)
     except click.exceptions.NoArgsIsHelpError as error:
         if _rank() == 0:
             print(error.format_message())
-        sys.exit(2)
     except click.ClickException as error:
         _say(error.format_message())
-        sys.exit(2)
     except KeyboardInterrupt:
         _say("interrupted")
-        sys.exit(INTERRUPTED)
-    except OSError as error:
-        if error.errno not in (errno.EPIPE, errno.ENOSPC):  # who read the output has left, or has no room
-            _unexpected(error)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # which is flushed at the end
-        _say("" if error.errno == errno.EPIPE else f"{error.filename or 'output'}: {error.strerror}")
-        sys.exit(1)
-    except Exception as error:
-        _unexpected(error)
+        return INTERRUPTED
+    return 2
 
 
 def _unexpected(error: Exception) -> NoReturn:
@@ -436,18 +445,16 @@ def _unexpected(error: Exception) -> NoReturn:
     if _by_interrupt(error):  # in a callback of PETSc
         _say("interrupted")
         sys.exit(INTERRUPTED)
-    MPI = getattr(sys.modules.get("mpi4py.MPI"), "COMM_WORLD", None)
     if isinstance(error, MemoryError) or "Out of memory" in str(error):
         _say("out of memory: take a coarser mesh, order 1, or in 3D --solver iterative")
-        if MPI is None or MPI.size == 1:
+        if _ranks() == 1:
             sys.exit(1)
-        sys.stderr.flush()
-        MPI.Abort(1)
-    if MPI is None or MPI.size == 1:
+    elif _ranks() == 1:
         raise error
-    traceback.print_exc()
+    else:
+        traceback.print_exc()
     sys.stderr.flush()
-    MPI.Abort(1)
+    sys.modules["mpi4py.MPI"].COMM_WORLD.Abort(1)
     raise error
 
 
@@ -517,6 +524,12 @@ def _rank() -> int:
     return int(next((os.environ[name] for name in launchers if name in os.environ), 0))
 
 
+def _ranks() -> int:
+    """How many ranks have been seen to run; one before MPI is loaded."""
+    mpi = sys.modules.get("mpi4py.MPI")
+    return int(mpi.COMM_WORLD.size) if mpi else 1
+
+
 def _load(name: str) -> Case:
     """A built-in case, or that of a TOML file."""
     if name in CASES:
@@ -550,13 +563,15 @@ def _as_options(given: set[str]) -> Iterator[None]:
 def _check_writable(field: str, path: Path) -> None:
     """Refuse, before a long run, a file that could not be written after it."""
     folder = path.parent
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
     try:
-        if path.is_file() or path.is_dir():
-            path.open("a").close()
-        elif not path.exists():  # nor a pipe, whose reader would see it closed
+        while not folder.exists() and folder != folder.parent:
+            folder = folder.parent
+        if not path.exists():
             tempfile.TemporaryFile(dir=folder).close()
+        elif path.is_file() or path.is_dir():
+            path.open("a").close()
+        elif not os.access(path, os.W_OK):  # a pipe, whose reader would see it closed
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except OSError as error:
         raise InputError(field, str(path), f"cannot be written ({error.strerror}); give another file") from None
 

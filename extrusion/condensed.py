@@ -38,7 +38,7 @@ from extrusion.errors import InputError
 from extrusion.gap import Array, Index
 from extrusion.mesh import on_root
 from extrusion.problem import BILLET_POINTS, Problem
-from extrusion.sparse import Sparse, Triplets
+from extrusion.sparse import Small, Sparse, Triplets
 from extrusion.system import System, in_words, node_positions
 
 log = logging.getLogger(__name__)
@@ -593,8 +593,8 @@ class _Tangent:
         self.set_accuracy(0.0, 0.0)
         # of each body, which forces have a part in the solve, and the rows of C that are read
         self._held = [(np.zeros(C.shape[0], dtype=bool), slice(0, 0)) for C in system.C]
-        self._cols: Index = np.zeros(0, dtype=np.int64)  # of D, what each column is, of all that is read
-        self._col = np.zeros(0, dtype=np.int32)  # and where each of these stands
+        self._cols: Index  # of D, what each column is, of all that is read
+        self._col: Small  # and where each of these stands
         self._pressed = np.zeros(system.n_multipliers, dtype=bool)  # multipliers that have a part in the solve
         self.forget()
 
@@ -616,13 +616,14 @@ class _Tangent:
         n_f = system.n_forces
         involved = np.zeros(0, dtype=np.int64)
         if D is not None:
-            self._diagonal = np.full(n_f + system.n_multipliers, -1.0)
+            self._diagonal, read = np.full(n_f + system.n_multipliers, -1.0), D.cols
             self._acts = acts = np.zeros(len(self._diagonal), dtype=bool)
             if system.n_multipliers:
                 own = (D.rows >= n_f) & (D.cols - system.n_read == D.rows - n_f)  # multipliers on their own rows
                 self._diagonal[n_f:] = np.bincount(D.rows[own] - n_f, D.values[own], system.n_multipliers)
+                read = D.cols[~own]
                 acts[D.rows[~own]] = True
-                acts[n_f + D.cols[~own & (D.cols >= system.n_read)] - system.n_read] = True
+                acts[n_f + read[read >= system.n_read] - system.n_read] = True
                 acts |= self._diagonal == 0.0
             else:
                 acts[D.rows] = True
@@ -631,23 +632,23 @@ class _Tangent:
         system.provide(involved)
         if D is None:
             return
-        self._hold(D)
+        self._hold(read)
         # multipliers that are not pressed have no row
         shape = len(self._entries), len(self._cols)
         self._D = D.assembled(self._row, self._col, shape, self._dtype)
-        self._fresh = self._lu is None
+        self._fresh = False  # whether it is this tangent that has been factored
         if self._lu is None:
             self._factor(self.PARALLEL)
         else:
             self._compile()
 
-    def _hold(self, D: Triplets) -> None:
+    def _hold(self, cols: Small) -> None:
         """C, and the multipliers, for all that acts and all that is read; if some has not been so, factor anew."""
         system, n_f = self._system, self._system.n_forces
-        if self._lu is not None and not self._acts[self._row < 0].any() and (self._col[D.cols] >= 0).all():
+        if self._lu is not None and not self._acts[self._row < 0].any() and (self._col[cols] >= 0).all():
             return
         read = np.zeros(system.n_read + system.n_multipliers, dtype=bool)
-        read[D.cols] = True
+        read[cols] = True
         same = self._lu is not None  # increment: what has been involved may be so again
         pressed = self._acts[n_f:]
         changes = not (same and (pressed <= self._pressed).all())
@@ -720,7 +721,7 @@ class _Tangent:
         pressed = self._D.first(kept, slice(n_u, len(self._cols)))
         M[:n, n:] = -pressed[:n]
         M[n:, n:] = pressed[n:]
-        self._lu = _factored(M)
+        self._lu, self._fresh = _factored(M), True
         self._compile()
 
     def _compile(self) -> None:

@@ -462,11 +462,14 @@ class Problem(System):
 
     # -- residual and tangent --------------------------------------------------------------------------------
 
-    def forces(self, x: PETSc.Vec) -> PETSc.Vec:
-        """Out-of-balance force of all dofs, N: at the supports their reactions, elsewhere the residual."""
+    def forces(self, x: PETSc.Vec, R: Array | None = None) -> PETSc.Vec:
+        """Out-of-balance force of all dofs, N: at the supports their reactions, elsewhere the residual.
+
+        R: `contact_forces`, if they are known.
+        """
         f = self._K_wide.createVecLeft()
         self._K_wide.mult(x, f)
-        R = self.contact_forces(self.gather(x))
+        R = self.contact_forces(self.gather(x)) if R is None else R
         f.array[self._x_mine] += R[self._z_mine]
         return f
 
@@ -692,22 +695,17 @@ class Problem(System):
     # -- reports ---------------------------------------------------------------------------------------------
 
     def balance(self, x: PETSc.Vec) -> tuple[float, float, float]:
-        f = self._K_wide.createVecLeft()
-        self._K_wide.mult(x, f)
-        energy = 0.5 * float(x.dot(f))
-        f.array[self._x_mine] += self.contact_forces(self.gather(x))[self._z_mine]
+        z = self.gather(x)
+        R = self.contact_forces(z)
+        f = self.forces(x, R)
+        energy = 0.5 * float(x.dot(f) - z[self._z_live] @ R[self._z_live])
         rear, die = float(f.array_r[self._driven].sum()), float(f.array_r[self._clamped_y].sum())
         f.destroy()
         rear, die = self.comm.allreduce(rear), self.comm.allreduce(die)
         if self.case.die == "rigid":
-            die = self.rigid_die_reaction(self.gather(x))
+            axial = slice(1, self.dim * len(self._live), self.dim)
+            die = -float(R[axial].sum())  # of what holds it
         return self.copies * rear, self.copies * die, self.copies * energy
-
-    def rigid_die_reaction(self, z: Array) -> float:
-        """Axial force of the supports on a rigid die, N: minus that of contact on the billet."""
-        axial = np.zeros(self.n_z, dtype=bool)
-        axial[1 : self.dim * len(self._live) : self.dim] = True
-        return -float(self.contact_forces(z)[axial].sum())
 
     def named_points(self) -> dict[str, tuple[int, int]]:
         """Rank and local dof block of each named point of the profile that is a node of the mesh."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import html
 import math
+import os
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -381,7 +382,7 @@ def run(
         if goal not in GOALS:
             raise InputError("goal", goal, f"choose one of {', '.join(GOALS)}")
     comm = MPI.COMM_WORLD if comm is None else comm
-    if out is not None and not isinstance(out, str | Path):
+    if out is not None and not isinstance(out, str | os.PathLike):
         raise InputError("out", out, "give a folder")
     if mesh is not None and not isinstance(mesh, str | Path) and not hasattr(mesh, "cells"):
         raise InputError("mesh", mesh, "give a mesh file, or what extrusion.mesh makes")

@@ -19,6 +19,7 @@ import pytest
 
 import extrusion
 from extrusion import cases, cli
+from extrusion.errors import InputError
 from extrusion.mesh import read_mesh
 from extrusion.mesh3d import read_hex
 from extrusion.newton import Newton
@@ -432,7 +433,7 @@ def test_tolerance_in_space(here: Path, caplog: pytest.LogCaptureFixture) -> Non
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize("args", ["list", "--version", "run --help"])
+@pytest.mark.parametrize("args", ["", "list", "--version", "run --help"])
 def test_full_output(args: str, unbuffered: str) -> None:
     """One line, whether it is told when it is written or when all is flushed."""
     start = [sys.executable, "-m", "extrusion", *args.split()]
@@ -440,7 +441,23 @@ def test_full_output(args: str, unbuffered: str) -> None:
         done = subprocess.run(
             start, stdout=full, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": unbuffered}
         )
-    assert (done.returncode, done.stderr) == (1, "extrusion: output: No space left on device\n")
+    told = "extrusion: No space left on device for the output, or for compiled forms\n"
+    assert (done.returncode, done.stderr) == (1, told)
+
+
+def test_no_output() -> None:
+    """Of a job that was started without one."""
+    done = subprocess.run(f"'{sys.executable}' -m extrusion list >&-", shell=True, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_pipe_that_may_be_written(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not opened beforehand, which would wait for its reader, or end it; refused if it may not be written."""
+    os.mkfifo("pipe")
+    cli._check_writable("json", Path("pipe"))
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(InputError, match="Permission denied"):
+        cli._check_writable("json", Path("pipe"))
 
 
 def test_list_and_version(capsys: Capture) -> None:
