@@ -107,6 +107,13 @@ def list_cases() -> None:
     help="Newton's method on contact's forces, or on all unknowns; iterative: these by multigrid, in 3d.",
 )
 @click.option(
+    "--guide",
+    default="auto",
+    show_default=True,
+    metavar="auto|on|off",
+    help="A coarser model that goes ahead, from which each increment starts.",
+)
+@click.option(
     "--tolerance", type=float, metavar="X", help="Relative error of the goal, for which the cheapest model is chosen."
 )
 @click.option("--goal", metavar="K|reaction", help="What the tolerance is of; by default K.")
@@ -136,6 +143,7 @@ def run(
     gamma: float | None,
     theta: int | None,
     solver: str,
+    guide: str,
     tolerance: float | None,
     goal: str | None,
     adapt: bool,
@@ -152,9 +160,9 @@ def run(
     given = {name for name, value in changes.items() if value is not None}
     logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, format="extrusion: %(message)s")
     if not quiet:
-        for name in ("condensed", "estimate", "adapt"):
+        for name in ("condensed", "guide", "estimate", "adapt"):
             logging.getLogger(f"extrusion.{name}").setLevel(logging.INFO)
-    with _as_options(given | {"out", "json", "solver", "tolerance", "goal", "adapt"}):
+    with _as_options(given | {"out", "json", "solver", "guide", "tolerance", "goal", "adapt"}):
         from extrusion.result import CHOSEN, changed
         from extrusion.result import run as solve
 
@@ -177,6 +185,7 @@ def run(
                 pictures=pictures,
                 observers=[*observers, interrupt],
                 solver=solver,
+                guide=guide,
                 tolerance=tolerance,
                 goal=cast("Goal", goal or "K"),
                 adapt=adapt,

@@ -87,6 +87,13 @@ def choose(problem: Problem, solver: str = "auto") -> System:
     return condensed if condensed is not None and chosen == "surface" else problem
 
 
+def seconds_an_iteration(problem: Problem, system: System) -> float:
+    """Estimated, of Newton's method, at the rates of `Cost`."""
+    if isinstance(system, Condensed):
+        return system.cost.surface
+    return ITERATIVE_RATE * problem.dofs / problem.comm.size if problem.iterates else FULL_RATE * problem.dofs
+
+
 def surface_memory(problem: Problem) -> float:
     """Bytes that the compliance takes at most: with all of its columns, and a copy in single precision, if any."""
     full = np.zeros(problem.n_z, dtype=bool)
@@ -105,6 +112,9 @@ ITERATIVE_RATE = 3e-5
 
 1.6e-5 to 1.9e-5 were measured at order 1, and 2.3e-5 to 6e-5 at order 2.
 """
+
+FULL_RATE = 6e-6
+"""And with all factored anew, in the plane; in space it is more."""
 
 ITERATIONS = 5
 """Newton iterations an increment that the choice of a solver counts with."""
@@ -393,6 +403,10 @@ class Condensed(System):
             values = self._out_of_balance(x, self._evaluated(x))
         except ArithmeticError:  # on rank 0 alone, unless the terms are divided
             values = np.full(max(f.local_size - 1, 0), np.nan)
+        self._put(f, values)
+
+    def _put(self, f: PETSc.Vec, values: Array) -> None:
+        """A residual's rows of forces and multipliers, on rank 0, into f."""
         out = f.array  # on every rank: PETSc counts changes, and forgets the norm
         out[1:] = values
         out[:1] = 0.0
@@ -403,7 +417,10 @@ class Condensed(System):
 
     def _out_of_balance(self, x: PETSc.Vec, z: Array) -> Array:
         """The residual's rows of forces and multipliers, on rank 0; z is given where it is `_evaluated`."""
-        R = self.contact_forces(z) if self.on_root or self.divided else np.zeros(0)
+        return self._less_forces(x, self.contact_forces(z) if self.on_root or self.divided else np.zeros(0))
+
+    def _less_forces(self, x: PETSc.Vec, R: Array) -> Array:
+        """The same from contact's forces."""
         if not self.on_root:
             return np.zeros(0)
         out = np.concatenate([R[self.z_forced], R[self.n_z - self.n_multipliers :]])
@@ -411,14 +428,31 @@ class Condensed(System):
         return out
 
     def tangent(self, x: PETSc.Vec, geometric: bool) -> PETSc.Mat:
-        D, f = None, np.zeros(0)
         z = self._evaluated(x)
-        if self.on_root or self.divided:
-            wanted = ((self._force_of_z >= 0) & self.on_root, self._row_of_z >= 0) if self.divided else ()
-            rows, cols, values = self.contact_tangent(z, geometric, *wanted)
-        if self.on_root:
+        return self._tangent_of(x, self._triplets(z, geometric) if self.on_root or self.divided else None)
+
+    def linearised(self, x: PETSc.Vec, f: PETSc.Vec, at: Array) -> PETSc.Mat:
+        D, R = None, np.full(self.n_z, np.nan)
+        z = self._evaluated(x)
+        try:
+            if self.on_root or self.divided:
+                D = self._triplets(at, False)
+                R = self.linear_forces(z, at, D)
+        except ArithmeticError:  # on rank 0 alone, unless the terms are divided
+            D = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0)
+        self._put(f, self._less_forces(x, R))
+        return self._tangent_of(x, D)
+
+    def _triplets(self, z: Array, geometric: bool) -> tuple[Index, Index, Array]:
+        wanted = ((self._force_of_z >= 0) & self.on_root, self._row_of_z >= 0) if self.divided else ()
+        return self.contact_tangent(z, geometric, *wanted)
+
+    def _tangent_of(self, x: PETSc.Vec, contact: tuple[Index, Index, Array] | None) -> PETSc.Mat:
+        """From contact's part, which rank 0 has."""
+        D, f = None, np.zeros(0)
+        if self.on_root and contact is not None:
             f = self._split(x)[1]
-            D = Triplets.placed(rows, cols, values, self._force_of_z, self._row_of_z)
+            D = Triplets.placed(*contact, self._force_of_z, self._row_of_z)
         self._tangent.set(D, f)
         return self._A
 

@@ -9,7 +9,7 @@ from petsc4py import PETSc
 
 import numpy as np
 
-from extrusion.system import System
+from extrusion.system import Forecast, System
 
 REASONS = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 
@@ -161,13 +161,16 @@ class Newton:
             return int(reason.DIVERGED_MAX_IT)
         return int(reason.ITERATING)
 
-    def solve(self, x: PETSc.Vec, at_most: int | None = None, ahead: float | None = 1.0, share: float = 0.0) -> Outcome:
+    def solve(
+        self, x: PETSc.Vec, at_most: int | None = None, ahead: float | Forecast | None = 1.0, share: float = 0.0
+    ) -> Outcome:
         """Solve from x, in place; x already carries the supports' values.
 
         Args:
             x: Start and result.
             at_most: Take no more than so many iterations.
-            ahead: The increment over the last one; None: the contact set is that of x.
+            ahead: What the end of the increment is predicted from: a forecast, or the increment over the last one;
+                None: from nothing, the contact set is that of x.
             share: End at this part of the first residual.
         """
         self._limit, self._share = self._max if at_most is None else min(at_most, self._max), share
@@ -182,15 +185,17 @@ class Newton:
         residual = self.history[-1] if self.history else np.inf  # SNES has not asked where the first one is no number
         return Outcome(reason > 0, iterations, residual, REASONS.get(reason, str(reason)))
 
-    def _predict(self, x: PETSc.Vec, ahead: float | None) -> int:
+    def _predict(self, x: PETSc.Vec, ahead: float | Forecast | None) -> int:
         """One linear solve with the contact set that is expected: it hardly moves in the die as the billet slides by.
 
-        Newton's method would find the ends of the contact by steps of a few facets. Kept unless the residual triples.
+        Newton's method would find the ends of the contact by steps of a few facets. With a forecast, contact is
+        linearised at its displacements. Kept unless the residual triples.
 
         Returns:
             How many linear solves it took.
         """
-        if not self.predicts or not self.problem.expect(ahead):
+        forecast = ahead if isinstance(ahead, Forecast) else None
+        if not self.predicts or not (forecast or self.problem.expect(ahead)):  # type: ignore[arg-type]
             return 0
         y, trial, f, ksp = self._step, self._trial, self._trial_f, self.snes.getKSP()
         self.problem.residual(x, f)
@@ -198,15 +203,26 @@ class Newton:
         if not before > self.tolerance:  # there is nothing to predict, or nothing to be had of it
             self.problem.expect(None)
             return 0
-        A = self.problem.tangent(x, False)
-        self.tangents += 1
-        ksp.setOperators(A)
-        ksp.solve(f, y)
+        if forecast:
+            at = self.problem.foresee(forecast, self.problem.gather(x))
+            A = self.problem.linearised(x, f, at)
+        else:
+            A = self.problem.tangent(x, False)
+        solves = int(np.isfinite(float(f.norm())))
+        if solves:
+            self.tangents += 1
+            ksp.setOperators(A)
+            ksp.solve(f, y)
         self.problem.expect(None)
+        if not solves:
+            return 0
         trial.waxpy(-1.0, y, x)
         self.problem.residual(trial, f)
         if float(f.norm()) < 3 * max(before, self.tolerance):  # the norm says little
             trial.copy(x)
             # with the contact set known it is nearer than its size says
             self._update = self.problem.largest_displacement(y) / 4
+            if forecast:
+                missed = self.problem.gather(x)[forecast.entries] - forecast.values
+                self._update = float(np.max(np.abs(missed), initial=0.0))
         return 1

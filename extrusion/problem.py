@@ -47,7 +47,7 @@ from extrusion.pairs import CurvePair, Pair
 from extrusion.pairs3d import COPIES, SurfacePair
 from extrusion.surfaces import FaceTrace, Trace, all_ranks, gather_faces, gather_trace
 from extrusion.system import System, in_words
-from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact
+from extrusion.zones import ContactTerm, IntegratedContact, MortarContact, NodalContact, Triplets
 
 if TYPE_CHECKING:
     from extrusion.krylov import Krylov
@@ -481,6 +481,10 @@ class Problem(System):
         except ArithmeticError:
             f.set(np.nan)
             return
+        self._add_contact(f, R)
+
+    def _add_contact(self, f: PETSc.Vec, R: Array) -> None:
+        """Contact's forces onto those of the bulk, and no rows at the supports."""
         values = f.array
         values[self._x_mine] += R[self._z_mine]
         values[self._held] = 0.0
@@ -488,16 +492,32 @@ class Problem(System):
     def tangent(self, x: PETSc.Vec, geometric: bool) -> PETSc.Mat:
         """Derivative of the residual; a new matrix whenever its pattern has grown."""
         z = self.gather(x)
+        return self._tangent_of(z, self._triplets(z, geometric))
+
+    def linearised(self, x: PETSc.Vec, f: PETSc.Vec, at: Array) -> PETSc.Mat:
+        self._K_wide.mult(x, f)
+        try:
+            D = self._triplets(at, False)
+            self._add_contact(f, self.linear_forces(self.gather(x), at, D))
+        except ArithmeticError:
+            f.set(np.nan)
+            return self.tangent_without_contact()
+        return self._tangent_of(at, D)
+
+    def _triplets(self, z: Array, geometric: bool) -> Triplets:
+        # with multipliers every rank needs their rows for the Krylov method
+        every = self._krylov is not None and self.n_multipliers
+        return self.contact_tangent(z, geometric, self.z_free if every else self._z_row, self.z_free)
+
+    def _tangent_of(self, z: Array, D: Triplets) -> PETSc.Mat:
+        """From contact's part, at z."""
         if self._krylov is not None:
-            # with multipliers every rank needs their rows
-            wanted = self.z_free if self.n_multipliers else self._z_row
-            D = self.contact_tangent(z, geometric, wanted, self.z_free)
             stiff = [term.stiff(z, self._z_of_billet) for term in self.terms]
             kappa = np.concatenate([part for _, part in stiff])
             self._krylov.set(D, self.of_all([part for part, _ in stiff], self._z_row, self.z_free), kappa)
             self._iterated.assemble()
             return self._iterated
-        rows, cols, values = self.contact_tangent(z, geometric, self._z_row, self.z_free)
+        rows, cols, values = D
         return self._tangent.fill(self.z_to_x[rows] - self._row0, self.z_to_x[cols], values)
 
     def largest_displacement(self, x: PETSc.Vec) -> float:

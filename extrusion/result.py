@@ -90,8 +90,10 @@ class Result:
     converged: bool
     error: str | None  # why the run stopped early
     solver: str  # surface, full or iterative
-    seconds: dict[str, float]  # setup, solve, output; of solve: on the surface factor and condensation, and pairing
+    # setup, solve, output; of solve: on the surface factor and condensation, and pairing, and what a guide took
+    seconds: dict[str, float]
     snapshots: Snapshots | None = field(repr=False)  # rank 0; None without accepted steps
+    guide: float | None = None  # mm: element size of the model that went ahead, if one did
     estimate: Estimate | None = None  # how far off it is, if the model was chosen for a tolerance
 
     @property
@@ -155,6 +157,7 @@ class Result:
             "contact_points": self.contact_points,
             "ranks": self.ranks,
             "solver": self.solver,
+            "guide": self.guide,
             "converged": self.converged,
             "error": self.error,
             "seconds": dict(self.seconds),
@@ -331,6 +334,7 @@ def run(
     out: str | Path | None = None,
     pictures: bool = True,
     solver: str = "auto",
+    guide: str = "auto",
     tolerance: float | None = None,
     goal: Goal = "K",
     adapt: bool = False,
@@ -348,6 +352,9 @@ def run(
         solver: "surface" (the bulk factored once, Newton's method on the forces of contact), "full" (on all unknowns),
             "iterative" (these by multigrid, in 3D), or "auto": the one that is estimated to be cheapest. All give the
             same answer, where there is but one.
+        guide: "on": a coarser model in the meridian plane goes ahead, and each increment starts from where its own
+            ends, so that Newton's method takes fewer iterations (`extrusion.guide`); "off"; or "auto": where it is
+            estimated to save more than it takes. The answer is the fine model's, to its tolerance.
         tolerance: Relative error of the goal for which the cheapest model is chosen (die, order, size, zones), in place
             of the case's own; the result has the `Estimate`.
         goal: "K" (its u_y) or "reaction".
@@ -368,6 +375,7 @@ def run(
 
     from extrusion import output
     from extrusion.condensed import SOLVERS, choose
+    from extrusion.guide import GUIDES, choose_guide
     from extrusion.newton import Newton
     from extrusion.painter import Painter
     from extrusion.problem import Problem
@@ -376,6 +384,8 @@ def run(
     _refuse_other(case)
     if solver not in SOLVERS:
         raise InputError("solver", solver, f"choose one of {', '.join(SOLVERS)}")
+    if guide not in GUIDES:
+        raise InputError("guide", guide, f"choose one of {', '.join(GUIDES)}")
     if goal != "K":
         from extrusion.estimate import GOALS
 
@@ -422,12 +432,13 @@ def run(
     began = time.perf_counter()
     system = choose(problem, solver)
     newton = Newton(system)
+    guided = choose_guide(problem, system, guide)
     seconds["solve"] += time.perf_counter() - began
 
     accepted: list[Step] = []
     error = None
     try:
-        with closing(_timed(steps(system, newton, case.times()), seconds, "solve")) as stepping:
+        with closing(_timed(steps(system, newton, case.times(), guided), seconds, "solve")) as stepping:
             for step in stepping:
                 began = time.perf_counter()
                 accepted.append(dataclasses.replace(step, recover=_gone))
@@ -440,6 +451,7 @@ def run(
         if close := getattr(observer, "close", None):
             close()
     seconds |= {**getattr(system, "seconds", {}), "pairing": system.pairing}
+    seconds |= {} if guided is None else {"guide": guided.seconds}
     points = sum(len(state.gap) for state in accepted[-1].zones.values()) if accepted else 0
     result = Result(
         case=case,
@@ -450,6 +462,7 @@ def run(
         converged=error is None,
         error=error,
         solver="surface" if system is not problem else "iterative" if problem.iterates else "full",
+        guide=None if guided is None else guided.size,
         seconds=seconds,
         snapshots=camera.snapshots(),
         estimate=estimate,
@@ -460,7 +473,7 @@ def run(
         if isinstance(plain, PlainMesh):  # on rank 0
             write_mesh(folder.path / "mesh.msh", plain)  # to run it again with --mesh
     if folder is not None:
-        options = {"mesh": given, "solver": solver, "tolerance": tolerance, "adapt": adapt or None}
+        options = {"mesh": given, "solver": solver, "guide": guide, "tolerance": tolerance, "adapt": adapt or None}
         folder.finish(result, {**options, **changes})
     return result
 

@@ -19,7 +19,7 @@ from extrusion.cases import Case
 from extrusion.errors import StepError
 from extrusion.newton import Newton, Outcome
 from extrusion.pairs import ContactState
-from extrusion.system import System
+from extrusion.system import Forecast, System
 
 log = logging.getLogger(__name__)
 
@@ -95,8 +95,16 @@ class Step:
         return self.recover()
 
 
-def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]:
+def steps(
+    problem: System, newton: Newton, times: list[float], foreseen: Callable[[float], Forecast | None] | None = None
+) -> Iterator[Step]:
     """Drive the billet through the times (mm), yielding accepted steps.
+
+    Args:
+        problem: The scene.
+        newton: What solves an increment.
+        times: Displacements of the rear face, increasing, mm.
+        foreseen: Gives the forecast for each of them, if there is one (`extrusion.guide.Guide`).
 
     Raises:
         StepError: An increment could not be solved even when cut; its message gives time, zone, place and remedy.
@@ -121,7 +129,10 @@ def steps(problem: System, newton: Newton, times: list[float]) -> Iterator[Step]
             x.axpy(dt, rate)
             problem.drive(x, goal)
             problem.forget_pattern()
-            outcome = _increment(problem, newton, accepted, dt / last if last else 1.0)
+            ahead: float | Forecast = dt / last if last else 1.0
+            if foreseen is not None and goal == target and not cuts:
+                ahead = foreseen(target) or ahead
+            outcome = _increment(problem, newton, accepted, ahead)
             iterations += outcome.iterations
             if outcome.converged:
                 try:
@@ -215,8 +226,8 @@ class _Attempt:
     remedy: str = ""
 
 
-def _increment(problem: System, newton: Newton, accepted: PETSc.Vec, ahead: float) -> _Attempt:
-    """Solve one predicted increment, so many times the last one, in place.
+def _increment(problem: System, newton: Newton, accepted: PETSc.Vec, ahead: float | Forecast) -> _Attempt:
+    """Solve one predicted increment, in place; ``ahead`` as `Newton.solve` has it.
 
     With frozen pairing that takes geometry passes (two at least, as the sheet).
 
@@ -270,7 +281,7 @@ def _increment(problem: System, newton: Newton, accepted: PETSc.Vec, ahead: floa
     return _Attempt(True, iterations, attempt, outcome.residual, outcome.reason)
 
 
-def _led(problem: System, newton: Newton, ahead: float) -> Outcome:
+def _led(problem: System, newton: Newton, ahead: float | Forecast) -> Outcome:
     """Solve one predicted increment, in place: with a soft contact first, if it is stiff, and led from there.
 
     Where the gap is curved or changes facet an update is off by some part of its square; times a large stiffness that

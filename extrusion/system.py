@@ -6,6 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,7 +18,16 @@ import numpy as np
 from extrusion.cases import Case
 from extrusion.gap import Array, Index
 from extrusion.pairs import ContactState
-from extrusion.zones import ContactTerm, MortarContact, Triplets
+from extrusion.zones import ContactSet, ContactTerm, MortarContact, Triplets
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What is known beforehand of the end of an increment (`extrusion.guide`)."""
+
+    entries: Index  # of the contact vector, displacements
+    values: Array  # these, mm
+    closed: list[ContactSet]  # of each zone
 
 
 class System(ABC):
@@ -70,6 +80,14 @@ class System(ABC):
     @abstractmethod
     def tangent(self, x: PETSc.Vec, geometric: bool) -> PETSc.Mat:
         """Derivative of the residual; ``geometric`` adds the second variation of the gap."""
+
+    @abstractmethod
+    def linearised(self, x: PETSc.Vec, f: PETSc.Vec, at: Array) -> PETSc.Mat:
+        """Residual into f, and the tangent, with contact linearised at another contact vector than that of x.
+
+        ``at``: equal to it wherever the supports, or nothing, say what z is. NaN into f where the surfaces have lost
+        each other there.
+        """
 
     @abstractmethod
     def set_solver(self, ksp: PETSc.KSP) -> None:
@@ -136,6 +154,11 @@ class System(ABC):
         with self._pairs():
             parts = [term.tangent(z, geometric) for term in self.terms]
             return joined(parts) if rows is None or cols is None else self.of_all(parts, rows, cols)
+
+    def linear_forces(self, z: Array, at: Array, tangent: Triplets) -> Array:
+        """Contact's forces at z as its forces and tangent at another contact vector have them."""
+        rows, cols, values = tangent
+        return self.contact_forces(at) + np.bincount(rows, values * (z - at)[cols], self.n_z)
 
     def of_all(self, parts: list[Triplets], rows: np.ndarray, cols: np.ndarray) -> Triplets:
         """Some rows and columns of all zones' triplets, and of all ranks' where terms are divided (collective then)."""
@@ -221,6 +244,14 @@ class System(ABC):
     def expect(self, ahead: float | None) -> bool:
         """Take the contact set that is expected as given (`ContactTerm.expect`); say if any zone has one."""
         return any([term.expect(ahead) for term in self.terms])
+
+    def foresee(self, forecast: Forecast, z: Array) -> Array:
+        """Take a forecast's contact set as given; returns the contact vector z with the forecast's displacements."""
+        for term, found in zip(self.terms, forecast.closed, strict=True):
+            term.follow(found)
+        at = z.copy()
+        at[forecast.entries] = forecast.values
+        return at
 
     # -- reports ---------------------------------------------------------------------------------------------
 

@@ -82,6 +82,12 @@ class ContactTerm(Protocol):
         ``ahead``: this increment over the last; 0: it goes on, with another pairing; None: expect nothing any more.
         """
 
+    def follow(self, found: ContactSet) -> None:
+        """Take this contact set for given, until the next `expect`; nodal contact does not."""
+
+    def contact_set(self, z: Array) -> ContactSet:
+        """What is closed at z; nothing, of nodal contact."""
+
     def state(self, z: Array) -> ContactState:
         """Report at z."""
 
@@ -97,18 +103,21 @@ class ContactSet:
     edges: Array  # in order, mm
 
     @classmethod
-    def of(cls, at: Array, trial: Array, closed: np.ndarray) -> ContactSet | None:
-        """From positions in any order, their trial stress and whether they are closed; None if none is.
+    def of(cls, at: Array, trial: Array, closed: np.ndarray) -> ContactSet:
+        """From positions in any order, their trial stress and whether they are closed.
 
         An edge stands where the trial stress, linear between the two points beside it, vanishes.
         """
-        if not np.any(closed):
-            return None
         order = np.argsort(at, axis=None, kind="stable")
         at, closed, size = (a.ravel()[order] for a in (at, closed, np.abs(trial)))
         i = np.flatnonzero(closed[1:] != closed[:-1])
         share = size[i] / np.maximum(size[i] + size[i + 1], np.finfo(float).tiny)
         return cls(bool(closed[0]), at[i] + share * (at[i + 1] - at[i]))
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is closed."""
+        return not self.first and not len(self.edges)
 
     def __call__(self, at: Array) -> np.ndarray:
         """Whether positions are closed."""
@@ -144,9 +153,13 @@ class Expected:
         self._now: ContactSet | None = None
         self._known = False
 
-    def accept(self, found: ContactSet | None) -> None:
+    def accept(self, found: ContactSet) -> None:
         """Take the set of an accepted step."""
-        self._before, self._accepted = self._accepted, found
+        self._before, self._accepted = self._accepted, None if found.empty else found
+
+    def follow(self, found: ContactSet) -> None:
+        """Expect this set."""
+        self._now, self._known = found, True
 
     def expect(self, ahead: float | None) -> bool:
         """Expect a set, its edges moved on by so many times their last change, and say if there is one.
@@ -169,10 +182,15 @@ class Expected:
         """Whether a set is expected."""
         return self._now is not None
 
-    def law(self, trial: Array, at: Array) -> tuple[Array, Array]:
-        """As `extrusion.contact.project`, of points at these places along the die, with the set that is expected."""
+    def law(self, trial: Array, at: Array, held: np.ndarray | None) -> tuple[Array, Array]:
+        """As `extrusion.contact.project`, of points at these places along the die, with the set that is expected.
+
+        ``held``: points that a bilateral closure holds, a shape that broadcasts to that of the trial stress.
+        """
         assert self._now is not None
         closed = self._now(at)
+        if held is not None:
+            closed |= held
         if not self._known:
             closed |= trial < 0.0
         return np.where(closed, trial, 0.0), closed.astype(float)
@@ -321,6 +339,12 @@ class NodalContact:
         # across an increment other nodes come to lie where the die is met; from pass to pass they are the same
         self._expects = ahead == 0.0 and self._last is not None
         return self._expects
+
+    def follow(self, found: ContactSet) -> None:
+        pass
+
+    def contact_set(self, z: Array) -> ContactSet:
+        return ContactSet(False, np.zeros(0))
 
     def stiffness_norm(self) -> float:
         return float(np.linalg.norm(self._kappa)) if self.multipliers else 0.0
@@ -474,10 +498,13 @@ class IntegratedContact:
     def expect(self, ahead: float | None) -> bool:
         return self._expected.expect(ahead)
 
-    def _found(self, z: Array) -> ContactSet | None:
+    def follow(self, found: ContactSet) -> None:
+        self._expected.follow(found)
+
+    def contact_set(self, z: Array) -> ContactSet:
         integrand = self._points(z)
-        points = integrand.points
-        closed = (trial := integrand.trial(z, self._k)[1]) < 0.0
+        points, trial = integrand.points, integrand.trial(z, self._k)[1]
+        closed = self._stress(z, points, trial)[1] > 0
         if not self.pair.extended:
             closed &= ~points.past
         return ContactSet.of(*self._of_all(points.facet, self.pair.along(z, points), trial, closed))
@@ -519,13 +546,19 @@ class IntegratedContact:
         """The slave's own stress, the contact stress, and its derivative by the trial stress."""
         points = integrand.points
         own, trial = integrand.trial(z, self._k)
-        if self._expected.on:
-            sc, dsc = self._expected.law(trial, self.pair.along(z, points))
-        else:
-            sc, dsc = project(trial, self.pair.closure, self.closed[points.facet][:, None])
+        sc, dsc = self._stress(z, points, trial)
         if not self.pair.extended:
             sc, dsc = np.where(points.past, 0.0, sc), np.where(points.past, 0.0, dsc)
         return own, sc, dsc
+
+    def _stress(self, z: Array, points: Points, trial: Array) -> tuple[Array, Array]:
+        """The contact stress, and its derivative by the trial stress."""
+        held = self.closed[points.facet][:, None]
+        if self._expected.on:
+            return self._expected.law(
+                trial, self.pair.along(z, points), held if self.pair.closure == "bilateral" else None
+            )
+        return project(trial, self.pair.closure, held)
 
     def add_residual(self, z: Array, R: Array) -> None:
         if self.pair.closure == "check" or (not self._theta and self._is_far(z)):
@@ -575,7 +608,7 @@ class IntegratedContact:
         if self.pair.closure == "check":
             return
         if self.pair.closure == "unilateral":
-            self._expected.accept(self._found(z))
+            self._expected.accept(self.contact_set(z))
         else:
             integrand = self._points(z)
             points, dsc = integrand.points, self._law(z, integrand)[2]
@@ -694,7 +727,8 @@ class MortarContact:
         weak, share, w = self._rows(points)
         trial = self._total * z[self.at] + self._k * weak
         if self._expected.on:
-            sc, dsc = self._expected.law(trial, self.pair.along_corners(z))
+            held = self.closed if self.pair.closure == "bilateral" else None
+            sc, dsc = self._expected.law(trial, self.pair.along_corners(z), held)
         else:
             sc, dsc = project(trial, self.pair.closure, self.closed)
         free = self._free(share)
@@ -769,10 +803,13 @@ class MortarContact:
     def expect(self, ahead: float | None) -> bool:
         return self._expected.expect(ahead)
 
-    def _found(self, z: Array) -> ContactSet | None:
-        weak, share, _ = self._rows(self._points(z))
-        trial = self._total * z[self.at] + self._k * weak
-        return ContactSet.of(self.pair.along_corners(z), trial, (trial < 0.0) & ~self._free(share))
+    def follow(self, found: ContactSet) -> None:
+        self._expected.follow(found)
+
+    def contact_set(self, z: Array) -> ContactSet:
+        points = self._points(z)
+        trial = self._total * z[self.at] + self._k * self._rows(points)[0]
+        return ContactSet.of(self.pair.along_corners(z), trial, self._law(z, points)[1] > 0)
 
     def stiff(self, z: Array, body: np.ndarray) -> tuple[Triplets, Array]:
         import scipy.sparse
@@ -794,7 +831,7 @@ class MortarContact:
 
     def accept(self, z: Array) -> None:
         if self.multipliers and self.pair.closure == "unilateral":
-            self._expected.accept(self._found(z))
+            self._expected.accept(self.contact_set(z))
         if self.multipliers and self.pair.closure == "bilateral":
             points, before = self._points(z), self.closed
             self.closed = (before | (self._law(z, points)[1] > 0)) & ~self._free(self._rows(points)[1])

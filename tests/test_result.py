@@ -64,7 +64,7 @@ def test_json(result: Result) -> None:
     """The object of ``--json``: these keys in this order, values unrounded, all of it strict JSON."""
     text = json.dumps(result.to_dict(), allow_nan=False)
     data = json.loads(text)
-    keys = "case method order die dofs contact_points ranks solver converged error seconds estimate steps"
+    keys = "case method order die dofs contact_points ranks solver guide converged error seconds estimate steps"
     assert " ".join(data) == keys
     assert list(data["seconds"]) == ["setup", "solve", "output", "factor", "condensation", "pairing"]
     step, last = data["steps"][-1], result.steps[-1]

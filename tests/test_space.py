@@ -331,7 +331,7 @@ def test_divided_facets(
         assert 0.3 * whole < part < 0.7 * whole
 
     z += 0.1 * np.random.default_rng(8).standard_normal(len(z))
-    sets = [side._found(z) for side in sides]
+    sets = [side.contact_set(z) for side in sides]
     assert len(sets[1].edges)
     assert_allclose(sets[0].edges, sets[1].edges, rtol=0, atol=1e-9)
     nodes, X = sides[0].pair.nodes, sides[0].pair.X

@@ -327,11 +327,14 @@ def test_contact_set_finds_its_edges_between_points() -> None:
     at = np.array([[3.0, 1.0], [0.0, 2.0]])  # in any order
     trial = np.array([[3.0, -1.0], [2.0, -1.0]])
     found = ContactSet.of(at, trial, trial < 0)
-    assert found is not None
     assert not found.first
+    assert not found.empty
     assert_allclose(found.edges, [2 / 3, 2.25])
     assert_array_equal(found(np.array([0.0, 1.0, 2.0, 2.5])), [False, True, True, False])
-    assert ContactSet.of(at, trial, trial > 9) is None
+    for closed in (False, True):
+        all_alike = ContactSet.of(at, trial, np.full_like(trial, closed, dtype=bool))
+        assert all_alike.empty is not closed
+        assert_array_equal(all_alike(at), np.full_like(trial, closed, dtype=bool))
 
 
 def test_edges_of_two_sets_pair_with_the_nearest_of_their_kind() -> None:
@@ -347,17 +350,23 @@ def test_expected_set_goes_on_as_it_did() -> None:
     assert not expected.expect(1.0)
     expected.accept(ContactSet(True, np.array([1.0])))
     assert expected.expect(1.0)  # all that is known is what was closed: points may close beside it
-    assert_array_equal(expected.law(pulled, at)[1], [1, 0, 0, 0])
-    assert_array_equal(expected.law(-pulled, at)[1], [1, 1, 1, 1])
+    assert_array_equal(expected.law(pulled, at, None)[1], [1, 0, 0, 0])
+    assert_array_equal(expected.law(-pulled, at, None)[1], [1, 1, 1, 1])
     expected.accept(ContactSet(True, np.array([1.2])))
     for ahead, closed in ((1.0, [1, 1, 0, 0]), (1.9, [1, 1, 0, 0]), (2.1, [1, 1, 1, 0])):  # 1.2 + ahead * 0.2
         assert expected.expect(ahead)
         for trial in (pulled, -pulled):
-            stress, slope = expected.law(trial, at)
+            stress, slope = expected.law(trial, at, None)
             assert_array_equal(slope, closed)
             assert_array_equal(stress, trial * closed)
     expected.accept(ContactSet(True, np.array([1.0, 2.0, 2.5])))  # edges that were not there before
     assert expected.expect(1.0)
-    assert_array_equal(expected.law(-pulled, at)[1], [1, 1, 1, 1])
+    assert_array_equal(expected.law(-pulled, at, None)[1], [1, 1, 1, 1])
+    expected.follow(ContactSet(True, np.array([1.5])))  # what another model has found is the whole set
+    held = np.array([False, False, False, True])
+    assert_array_equal(expected.law(-pulled, at, None)[1], [1, 1, 0, 0])
+    assert_array_equal(expected.law(pulled, at, held)[1], [1, 1, 0, 1])
     assert not expected.expect(None)
     assert not expected.on
+    expected.accept(ContactSet(False, np.zeros(0)))
+    assert not expected.expect(1.0)

@@ -1,0 +1,219 @@
+"""A coarse model that goes ahead of a fine one: where its increments end, the fine one's begin to look.
+
+Newton's method converges quadratically, and an increment's own start is a millimetre or more away: it takes four to
+six linear solves. The same scene on a mesh some times coarser, in the meridian plane, is solved in a fraction of the
+time to a few hundredths of a millimetre; with contact linearised there, and with its contact set, the first solve ends
+so near that two more do. The answer is that of the fine model: it only starts elsewhere. Nested iteration:
+Kronsjö, Dahlquist, BIT 12 (1972) 63, doi:10.1007/BF01932674.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+from mpi4py import MPI
+
+import numpy as np
+
+from extrusion.cases import Case
+from extrusion.condensed import ITERATIONS, Condensed, seconds_an_iteration
+from extrusion.errors import InputError, StepError
+from extrusion.gap import Array, Index, Surface, shape
+from extrusion.gap3d import radial
+from extrusion.mesh import case_mesh, on_root
+from extrusion.newton import Newton
+from extrusion.pairs import Pair
+from extrusion.problem import Problem
+from extrusion.result import changed
+from extrusion.stepping import steps
+from extrusion.system import Forecast, System, node_positions
+
+log = logging.getLogger(__name__)
+
+GUIDES = ("auto", "on", "off")
+
+COARSE = 1 / 12.5
+"""Element size of a guide, of the billet's radius: 4 mm in SSNV504; twice it, half, .. where `COARSER` asks."""
+
+COARSER = (2.0, 8.0)
+"""How many times larger a guide's elements are than those it guides, at least (in the plane) and at most."""
+
+ROUGHLY = 1e-4
+"""Residual at which a guide's increment ends, of E times the radius squared: 1250 N in SSNV504, where 8e5 N press."""
+
+
+SAVED = 0.25
+"""Part of Newton's iterations that a guide saves: 0.2 to 0.45 were measured, and 0.1 to 0.25 in 3D."""
+
+
+def choose_guide(problem: Problem, system: System, guide: str = "auto") -> Guide | None:
+    """The guide of a scene, if it has one: auto takes one that is estimated to save more than it takes. Collective.
+
+    Args:
+        problem: The scene.
+        system: What is solved (`extrusion.condensed.choose`).
+        guide: One of `GUIDES`.
+
+    Raises:
+        InputError: There is no such choice, or no guide can be had and it is asked for.
+    """
+    if guide not in GUIDES:
+        raise InputError("guide", guide, f"choose one of {', '.join(GUIDES)}")
+    case = problem.case
+    size = guide_size(problem)
+    if guide == "off":
+        return None
+    if case.method == "nodal" or size is None:
+        if guide == "on":
+            why = "nodal contact pairs its nodes anew" if case.method == "nodal" else "there is no coarser mesh"
+            raise InputError("guide", guide, f"{why}: leave it out")
+        return None
+    iterations = ITERATIONS * len(case.times())
+    each = COARSE * case.profile.radius / size
+    takes = 0.1 * each + 0.7 * iterations * (0.6e-3 + 0.7e-3 * each)
+    saves = SAVED * iterations * seconds_an_iteration(problem, system)
+    if guide == "auto" and saves < takes:
+        return None
+    try:
+        made = Guide(problem, size)
+    except InputError:  # no gmsh for its mesh
+        if guide == "on":
+            raise
+        return None
+    if problem.comm.rank == 0:
+        log.info("guided by P2 triangles of %g mm: estimated to take %.2g s and to save %.2g s", size, takes, saves)
+    return made
+
+
+def guide_size(problem: Problem) -> float | None:
+    """Element size of a scene's guide, mm; None where that would be no mesh."""
+    case, profile = problem.case, problem.case.profile
+    fine = case.mesh_size if case.mesh is None else None  # that of a graded mesh is what its sizes are in proportion to
+    fine, size = fine or float(np.median(problem.terms[0].pair.lengths)), COARSE * profile.radius
+    while size > COARSER[1] * fine:
+        size /= 2
+    while problem.dim == 2 and size < COARSER[0] * (1 - 1e-6) * fine:
+        size *= 2
+    return size if size <= profile.length / 8 else None
+
+
+class Guide:
+    """Forecasts of a scene's increments, from a coarser model of it that is solved on rank 0 alone. Collective.
+
+    Args:
+        problem: What is to be guided.
+        size: Element size of the guide, mm.
+    """
+
+    def __init__(self, problem: Problem, size: float) -> None:
+        self._comm, self.size, self.seconds = problem.comm, size, 0.0
+        with self._ahead_of_it():
+            self._ahead = on_root(problem.comm, lambda: _Ahead(problem, size))
+
+    def __call__(self, t: float) -> Forecast | None:
+        """The forecast for the increment that ends at t, mm, which is to grow from call to call; None if there is none.
+
+        Collective.
+        """
+        with self._ahead_of_it():
+            found = None if self._ahead is None else self._ahead.at(t)
+            return self._comm.bcast(found) if self._comm.size > 1 else found
+
+    @contextmanager
+    def _ahead_of_it(self) -> Iterator[None]:
+        """Time what is done, and let only the guided model speak: what its guide would say is not of the run."""
+        began, all_of_us = time.perf_counter(), logging.getLogger("extrusion")
+        level = all_of_us.level
+        all_of_us.setLevel(logging.CRITICAL)
+        try:
+            yield
+        finally:
+            all_of_us.setLevel(level)
+            self.seconds += time.perf_counter() - began
+
+
+class _Ahead:
+    """The coarser model, as far as it has been solved."""
+
+    def __init__(self, problem: Problem, size: float) -> None:
+        case = guiding(problem.case, size)
+        self._system = Condensed(Problem(case, case_mesh(case.profile, size), MPI.COMM_SELF))
+        pairs = [(coarse.pair, fine.pair) for coarse, fine in zip(self._system.terms, problem.terms, strict=True)]
+        links = [link for ours, theirs in pairs for link in _links(ours, theirs)]
+        free = [problem.z_free[link.entries] for link in links]
+        self._links = [link.only(of) for link, of in zip(links, free, strict=True)]
+        self._entries = np.concatenate([link.entries for link in self._links])
+        newton = Newton(self._system, atol=ROUGHLY * case.billet.E * case.profile.radius**2)
+        self._steps = steps(self._system, newton, case.times())
+
+    def at(self, t: float) -> Forecast | None:
+        """The forecast for t, mm."""
+        try:
+            step = next((step for step in self._steps if step.t >= t), None)
+        except StepError:  # no further
+            return None
+        if step is None or step.t != t:
+            return None
+        z = self._system.gather(self._system.x)
+        values = np.concatenate([link(z) for link in self._links])
+        return Forecast(self._entries, values, [term.contact_set(z) for term in self._system.terms])
+
+
+@dataclass(frozen=True)
+class _Link:
+    """Displacements of a surface's nodes from those of a coarse curve."""
+
+    entries: Index  # (n,) of the fine contact vector
+    cols: Index  # (n, L) of the coarse one
+    weights: Array  # (n, L)
+
+    def only(self, some: np.ndarray) -> _Link:
+        """Some of the entries."""
+        return _Link(self.entries[some], self.cols[some], self.weights[some])
+
+    def __call__(self, z: Array) -> Array:
+        return np.asarray((self.weights * z[self.cols]).sum(axis=1))
+
+
+def _links(coarse: Pair, fine: Pair) -> list[_Link]:
+    """From a zone's slave and die to those of another mesh, each node from where it lies on the meridian."""
+    out = []
+    for curve, surface in ((coarse.slave, fine.slave), (coarse.die, fine.die)):
+        nodes = np.unique(surface.nodes)
+        if not len(nodes):  # a rigid die of revolution
+            continue
+        X = node_positions(surface, nodes)
+        if fine.dim == 2:
+            place, by = X, np.broadcast_to(np.eye(2), (len(X), 2, 2))
+        else:
+            place, by = np.column_stack([np.hypot(X[:, 0], X[:, 2]), X[:, 1]]), np.zeros((len(X), 3, 2))
+            by[:, :, 0], by[:, 1, 1] = radial(X), 1.0
+        facet, xi = _nearest(curve, place)
+        N = shape(xi, curve.nodes.shape[1])
+        cols = 2 * curve.nodes[facet][:, None, :, None] + np.arange(2)
+        weights = N[:, None, :, None] * by[:, :, None]
+        entries = fine.dim * nodes[:, None] + np.arange(fine.dim)
+        cols = np.broadcast_to(cols, weights.shape)
+        out.append(_Link(entries.ravel(), cols.reshape(entries.size, -1), weights.reshape(entries.size, -1)))
+    return out
+
+
+def _nearest(curve: Surface, x: Array) -> tuple[Index, Array]:
+    """The facet of a curve that each point is nearest to, and where on it, in [0, 1]."""
+    start, along = curve.X[:, 0], curve.X[:, 1] - curve.X[:, 0]
+    xi = np.einsum("nmi,mi->nm", x[:, None] - start, along) / (along**2).sum(axis=1)
+    xi = np.clip(xi, 0.0, 1.0)
+    off = np.linalg.norm(x[:, None] - start - xi[..., None] * along, axis=-1)
+    facet = np.argmin(off, axis=1)
+    return facet, xi[np.arange(len(x)), facet]
+
+
+def guiding(case: Case, size: float) -> Case:
+    """The scene of a guide: in the meridian plane, P2 elements, Nitsche's method as it is by default."""
+    space = "axisymmetric" if case.space == "3d" else case.space
+    case = changed(case, space=space, size=size, off_symmetry=0.0)
+    return replace(case, method="nitsche", order=2, gamma=None, theta=0, form=None)

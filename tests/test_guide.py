@@ -1,0 +1,341 @@
+"""A coarser model that goes ahead: what it foresees, and that the answer is the fine model's."""
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from numpy.testing import assert_allclose
+
+from extrusion import cases, guide
+from extrusion.cases import Case, Elastic
+from extrusion.cli import app
+from extrusion.condensed import Condensed
+from extrusion.errors import InputError, StepError
+from extrusion.guide import Guide, choose_guide, guide_size, guiding
+from extrusion.newton import Newton
+from extrusion.problem import Problem
+from extrusion.result import _mesh, changed, run
+from extrusion.stepping import Step, steps
+from extrusion.system import Forecast, System
+from extrusion.zones import ContactSet
+
+A = changed(cases.A, method="nitsche", order=2, size=2.0, increment=5.0, until=60.0)
+
+
+def scene(case: Case, comm: MPI.Intracomm = MPI.COMM_SELF) -> Problem:
+    return Problem(case, _mesh(comm, case, None), comm)
+
+
+def taken(system: System, foreseen: Callable[[float], Forecast | None] | None = None) -> list[Step]:
+    return list(steps(system, Newton(system), system.case.times(), foreseen))
+
+
+@pytest.mark.parametrize(
+    ("changes", "most"),
+    [
+        ({}, 0.75),
+        ({"method": "mortar"}, 0.85),
+        ({"method": "penalty"}, 0.75),
+        ({"die": "rigid", "increment": 20.0}, 0.7),
+        ({"theta": 1, "gamma": 40.0}, 0.65),
+        ({"space": "plane strain"}, 0.95),
+        ({"billet": Elastic(5000.0, 0.4999)}, 0.85),
+    ],
+    ids=str,
+)
+def test_the_same_answer_sooner(changes: dict[str, Any], most: float) -> None:
+    problem = scene(changed(A, **changes))
+    plain, guided = taken(Condensed(problem)), taken(Condensed(problem), Guide(problem, 4.0))
+    for one, other in zip(plain, guided, strict=True):
+        assert other.points["K"] == pytest.approx(one.points["K"], abs=1e-7)
+        assert other.reaction == pytest.approx(one.reaction, abs=1e-2)
+    assert sum(step.iterations for step in guided) <= most * sum(step.iterations for step in plain)
+
+
+@pytest.mark.parametrize("method", ["nitsche", "mortar"])
+def test_a_zone_that_is_held(method: str) -> None:
+    """Glissière: points that are held stay so, wherever the guide's contact ends."""
+    problem = scene(changed(cases.C, method=method, order=2, size=2.0, increment=5.0, until=60.0, figures=()))
+    plain, guided = taken(Condensed(problem)), taken(Condensed(problem), Guide(problem, 4.0))
+    for one, other in zip(plain, guided, strict=True):
+        assert other.points["K"] == pytest.approx(one.points["K"], abs=1e-7)
+    assert sum(step.iterations for step in guided) <= 0.85 * sum(step.iterations for step in plain)
+
+
+def test_most_steps_take_one_or_two_iterations() -> None:
+    """After the solve that the guide predicts, on a mesh half as coarse."""
+    problem = scene(replace(A, size=1.0).with_increment(5.0, 100.0))
+    guided = taken(Condensed(problem), Guide(problem, 2.0))[1:]  # the first one has nothing to solve
+    assert sum(step.iterations <= 3 for step in guided) > len(guided) / 2
+    assert sum(step.tangents <= 3 for step in guided) > 0.9 * len(guided)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(("solver", "method"), [("surface", "nitsche"), ("full", "mortar")])
+def test_on_two_ranks(solver: str, method: str) -> None:
+    problem = scene(changed(A, method=method, size=4.0, until=30.0), MPI.COMM_WORLD)
+    system = Condensed(problem) if solver == "surface" else problem
+    plain, guided = taken(system), taken(system, Guide(problem, 8.0))
+    assert guided[-1].reaction == pytest.approx(plain[-1].reaction, abs=1e-3)
+    counts = MPI.COMM_WORLD.allgather([step.iterations for step in guided])
+    assert all(count == counts[0] for count in counts)
+    assert sum(counts[0]) < sum(step.iterations for step in plain)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("iterates", [False, True])
+def test_in_space(iterates: bool) -> None:
+    """Guided in the meridian plane; glissière; with multigrid the terms may be divided among ranks."""
+    case = changed(cases.B, method="nitsche", order=1, size=8.0, increment=5.0, until=15.0, figures=())
+    problem = scene(case, MPI.COMM_WORLD)
+    if iterates:
+        problem.iterate()
+    system: System = problem if iterates else Condensed(problem)
+    plain, guided = taken(system), taken(system, Guide(problem, 4.0))
+    assert guided[-1].points["K"] == pytest.approx(plain[-1].points["K"], abs=1e-7)
+    assert sum(step.iterations for step in guided) < sum(step.iterations for step in plain)
+
+
+@pytest.mark.parametrize("surface", [True, False])
+def test_linearised_elsewhere(surface: bool) -> None:
+    """At x itself it is residual and tangent; at a distance d it is off by what the gap's second variation, which is
+    left out, makes of d, and some part of d squared."""
+    problem = scene(replace(A, size=4.0).with_increment(5.0, 20.0))
+    system: System = Condensed(problem) if surface else problem
+    *_, _last = taken(system)
+    x, z = system.x, system.gather(system.x)
+    f, g, image = (x.duplicate() for _ in range(3))
+    system.residual(x, g)
+    system.tangent(x, False).mult(x, image)
+    size = image.norm()
+    A_ = system.linearised(x, f, z)
+    assert_allclose(f.array_r, g.array_r, rtol=0, atol=1e-4)
+    A_.mult(x, g)
+    assert_allclose(g.array_r, image.array_r, rtol=0, atol=1e-9 * size)
+    direction = np.where(problem.z_free, np.cos(np.arange(len(z))), 0.0)
+    closed = [term.contact_set(z) for term in system.terms]
+    none = np.zeros(0, dtype=np.int64)
+    system.foresee(Forecast(none, np.zeros(0), closed), z)
+    (rows, cols, plain), (more_rows, more_cols, whole) = (system.contact_tangent(z, which) for which in (False, True))
+    turned = np.bincount(more_rows, whole * direction[more_cols], len(z))
+    turned -= np.bincount(rows, plain * direction[cols], len(z))
+    off = []
+    for d in (2e-4, 1e-4):
+        D = system.contact_tangent(z + d * direction, False)
+        off.append(
+            np.linalg.norm(system.linear_forces(z, z + d * direction, D) - system.contact_forces(z) - d * turned)
+        )
+    assert off[0] > 1e-3
+    assert 3.0 < off[0] / off[1] < 5.0  # 4
+    system.linearised(x, f, z + d * direction)
+    system.expect(None)
+    system.residual(x, g)
+    f.axpy(-1.0, g)
+    assert f.norm() < 2 * d * np.linalg.norm(turned)
+
+
+def test_nothing_is_linearised_where_surfaces_are_lost() -> None:
+    problem = scene(replace(A, size=4.0))
+    for system in (Condensed(problem), problem):
+        list(steps(system, Newton(system), [5.0]))
+        f, lost = system.x.duplicate(), system.gather(system.x)
+        lost[1::2] = -1e3 * np.sign(np.cos(np.arange(len(lost[1::2]))))  # facets turned round
+        lost[::2] = np.nan
+        system.linearised(system.x, f, lost)
+        assert not np.isfinite(f.norm())
+
+
+def test_displacements_are_carried_over() -> None:
+    """A quadratic displacement of the guide's nodes along each straight piece is that of the finer mesh's nodes."""
+    problem = scene(replace(A, size=1.5))
+    ahead = guide._Ahead(problem, 4.0)
+
+    def field(X: np.ndarray) -> np.ndarray:
+        r, y = X[..., 0] / 50, X[..., 1] / 65
+        return np.stack([1 + r - 2 * y + 3 * y * y, 2 - y + r * y - r * r], axis=-1)
+
+    z = np.zeros(ahead._system.n_z)
+    for term in ahead._system.terms:
+        for surface in (term.pair.slave, term.pair.die):
+            z[2 * surface.nodes[..., None] + np.arange(2)] = field(surface.X)
+    found = np.full(problem.n_z, np.nan)
+    found[ahead._entries] = np.concatenate([link(z) for link in ahead._links])
+    for term in problem.terms:
+        for surface in (term.pair.slave, term.pair.die):
+            entries = 2 * surface.nodes[..., None] + np.arange(2)
+            free = problem.z_free[entries]
+            assert free.mean() > 0.9
+            assert_allclose(found[entries][free], field(surface.X)[free], rtol=0, atol=1e-9)
+
+
+def test_displacements_are_carried_into_space() -> None:
+    """u = (r, 2 y) in the meridian plane is (x, 2 y, z) in space."""
+    case = changed(cases.B, method="nitsche", order=2, size=12.0, figures=())
+    problem = scene(case)
+    ahead = guide._Ahead(problem, 8.0)
+    z, found = np.zeros(ahead._system.n_z), np.full(problem.n_z, np.nan)
+    for term in ahead._system.terms:
+        for surface in (term.pair.slave, term.pair.die):
+            z[2 * surface.nodes[..., None] + np.arange(2)] = surface.X * [1, 2]
+    found[ahead._entries] = np.concatenate([link(z) for link in ahead._links])
+    for term in problem.terms:
+        for surface in (term.pair.slave, term.pair.die):
+            entries = 3 * surface.nodes[..., None] + np.arange(3)
+            free = problem.z_free[entries]
+            assert_allclose(found[entries][free], (surface.X * [1, 2, 1])[free], rtol=0, atol=1e-9)
+
+
+def test_what_it_foresees_is_near() -> None:
+    problem = scene(A)
+    ahead = Guide(problem, 4.0)
+    for step in steps(problem, Newton(problem), A.times()):
+        forecast = ahead(step.t)
+        assert forecast is not None
+        z = problem.gather(step.x)
+        assert np.abs(z[forecast.entries] - forecast.values).max() < 0.2
+        ours, theirs = (
+            found.closed for found in (replace(forecast, closed=[t.contact_set(z) for t in problem.terms]), forecast)
+        )
+        if step.t > 5.0:
+            assert ours[0].edges[0] == pytest.approx(theirs[0].edges[0], abs=1.0)
+
+
+@pytest.mark.parametrize("surface", [True, False])
+@pytest.mark.parametrize("far", [5.0, 1e6, np.nan])
+def test_a_forecast_that_is_wrong(surface: bool, far: float) -> None:
+    """It is dropped, or the step is cut and goes on without: the answer is the same."""
+    problem = scene(changed(A, size=4.0, until=20.0))
+    system: System = Condensed(problem) if surface else problem
+    true, plain = Guide(problem, 8.0), taken(system)
+
+    def wrong(t: float) -> Forecast | None:
+        found = true(t)
+        assert found is not None
+        shaken = found.values + far * np.cos(np.arange(len(found.values)))
+        return Forecast(found.entries, shaken, [ContactSet(False, np.zeros(0)) for _ in found.closed])
+
+    found = taken(system, wrong)
+    assert [step.t for step in found] == [step.t for step in plain]
+    assert found[-1].reaction == pytest.approx(plain[-1].reaction, abs=1e-3)
+
+
+def test_a_guide_that_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The guided model goes on by itself."""
+    problem = scene(changed(A, size=4.0, until=20.0))
+
+    def stopping(*of: Any) -> Any:
+        for step in steps(*of):
+            if step.t > 10.0:
+                raise StepError("no further")
+            yield step
+
+    monkeypatch.setattr(guide, "steps", stopping)
+    ahead = Guide(problem, 8.0)
+    found = taken(Condensed(problem), ahead)
+    assert [step.t for step in found] == [5.0, 10.0, 15.0, 20.0]
+    assert [ahead(t) for t in (15.0, 20.0)] == [None, None]
+
+
+def test_only_ends_of_increments_are_foreseen() -> None:
+    ahead = Guide(scene(changed(A, size=4.0, until=20.0)), 8.0)
+    assert ahead(5.0) is not None
+    assert ahead(7.0) is None
+    assert ahead(15.0) is not None
+
+
+def test_only_the_guided_model_speaks(caplog: pytest.LogCaptureFixture) -> None:
+    """The scene is warned of once, and the logger's level is what it was."""
+    case = replace(changed(A, size=4.0, until=5.0), die_material=Elastic(2000.0, 0.3))
+    logging.getLogger("extrusion").setLevel(logging.INFO)
+    try:
+        problem = scene(case)
+        assert len(caplog.records) == 1
+        taken(problem, Guide(problem, 8.0))
+        assert len(caplog.records) == 1
+        assert logging.getLogger("extrusion").level == logging.INFO
+    finally:
+        logging.getLogger("extrusion").setLevel(logging.NOTSET)
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"), [(10.0, None), (4.0, 8.0), (2.0, 4.0), (1.0, 4.0), (0.4, 2.0), (0.1, 0.5)]
+)
+def test_size(size: float, expected: float | None) -> None:
+    """Twice to eight times as large, and one that is shipped."""
+    problem = scene(replace(A, size=4.0))
+    problem.case = replace(A, size=size)
+    assert guide_size(problem) == expected
+
+
+def test_size_for_a_mesh_that_is_given() -> None:
+    problem = scene(replace(A, size=None))  # 5 mm
+    problem.case = replace(problem.case, mesh="some.msh")
+    assert guide_size(problem) is None
+    problem.case = replace(problem.case, space="3d", order=1)
+    problem.dim = 3
+    assert guide_size(problem) == 4.0  # in the plane it is cheap at any size
+
+
+def test_case() -> None:
+    """Whatever is guided, its guide is P2 and Nitsche's method as it is by default, in the meridian plane."""
+    case = changed(cases.J, method="penalty", order=2, figures=(), size=7.0, increment=5.0)
+    plain = guiding(case, 4.0)
+    assert (plain.space, plain.method, plain.order, plain.size) == ("axisymmetric", "nitsche", 2, 4.0)
+    assert (plain.mesh, plain.sectors, plain.off_symmetry) == (None, None, 0.0)
+    assert plain.times() == case.times()
+    assert plain.zones == case.zones
+
+
+def test_chosen_where_it_saves(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = scene(replace(A, size=4.0))
+    system = Condensed(problem)
+    assert choose_guide(problem, system) is None
+    assert choose_guide(problem, system, "off") is None
+    assert choose_guide(problem, problem) is not None  # where each iteration factors anew
+    monkeypatch.setattr(guide, "seconds_an_iteration", lambda *of: 1.0)
+    found = choose_guide(problem, system)
+    assert found is not None
+    assert found.size == 8.0
+    assert choose_guide(problem, system, "off") is None
+
+    def no_gmsh(*of: Any) -> Any:
+        raise InputError("size", 8.0, "needs gmsh")
+
+    monkeypatch.setattr(guide, "case_mesh", no_gmsh)
+    assert choose_guide(problem, system) is None
+    with pytest.raises(InputError, match="gmsh"):
+        choose_guide(problem, system, "on")
+
+
+@pytest.mark.parametrize(
+    ("changes", "choice", "message"),
+    [
+        ({}, "maybe", "guide = 'maybe': choose one of auto, on, off"),
+        ({"method": "nodal"}, "on", "guide = 'on': nodal contact pairs its nodes anew: leave it out"),
+        ({"size": 10.0}, "on", "guide = 'on': there is no coarser mesh: leave it out"),
+    ],
+)
+def test_refused(changes: dict[str, Any], choice: str, message: str) -> None:
+    with pytest.raises(InputError) as told:
+        run(A, until=5.0, guide=choice, **changes)
+    assert str(told.value) == message
+
+
+def test_from_the_command_line(tmp_path: Path) -> None:
+    args = ["run", "A", "--method", "nitsche", "--order", "2", "--size", "4", "--until", "10", "--no-pictures"]
+    args += ["--out", str(tmp_path / "a"), "--json", "-"]
+    done = CliRunner().invoke(app, [*args, "--guide", "on"])
+    assert done.exit_code == 0, done.output
+    data = json.loads(done.stdout)
+    assert data["guide"] == 8.0
+    assert data["seconds"]["guide"] > 0
+    assert json.loads((tmp_path / "a" / "run.json").read_text())["options"]["guide"] == "on"
+    assert json.loads(CliRunner().invoke(app, args).stdout)["guide"] is None
