@@ -39,6 +39,7 @@ from extrusion.elasticity import epsilon, sigma
 from extrusion.errors import InputError, StepError
 from extrusion.estimate import GOALS, Error, Estimate, Goal, Part, continuous, reaction_scale, tell_space
 from extrusion.gap import Array
+from extrusion.guide import choose_guide
 from extrusion.mesh import PlainMesh, graded_mesh, on_root, sized_mesh
 from extrusion.newton import Newton
 from extrusion.problem import Problem
@@ -285,7 +286,7 @@ def estimated(case: Case, mesh: PlainMesh, goal: Goal) -> tuple[Error, Array, fl
     every = math.ceil(len(times) / STATIONS)
     done: list[Step] = []
     found: list[tuple[Step, dict[Goal, Array]]] = []
-    for step in steps(system, Newton(system), times):
+    for step in steps(system, Newton(system), times, choose_guide(problem, system)):
         done.append(step)
         if (len(times) - len(done)) % every == 0:
             found.append((step, indicators(problem, step.x, GOALS, recovery)))

@@ -57,6 +57,7 @@ class Cell:
     die: str
     solver: str
     until: float = 155.0  # mm
+    guide: str = "auto"
     turn: int = 0
 
     def case(self) -> Case:
@@ -66,7 +67,8 @@ class Cell:
 
     def __str__(self) -> str:
         mesh = "sheet" if self.size is None else f"{self.size:g} mm"
-        return f"{self.part} {self.method} P{self.order} {mesh} {self.die} {self.solver} to {self.until:g}"
+        guide = "" if self.guide == "auto" else f" guide {self.guide}"
+        return f"{self.part} {self.method} P{self.order} {mesh} {self.die} {self.solver}{guide} to {self.until:g}"
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ class Outcome:
     setup: float = math.nan  # CPU s, as are the next four
     factor: float = math.nan  # of the bulk, once (surface solver; the full one factors in its steps)
     condensation: float = math.nan
-    steps: float = math.nan
+    steps: float = math.nan  # with the guide, if there is one
     output: float = math.nan  # displacements and stresses at all dofs at three t
     wall: float = math.nan  # s, of all five
     base: float = math.nan  # MB, before
@@ -114,7 +116,7 @@ def cells(*, quick: bool = False) -> list[Cell]:
 
 
 def _pairs(size: float, until: float) -> list[Cell]:
-    one = Cell("pairs", "nitsche", 2, size, "elastic", "surface", until)
+    one = Cell("pairs", "nitsche", 2, size, "elastic", "surface", until, guide="off")  # of the two, one might take it
     return [replace(one, solver=solver, turn=turn) for turn in range(PAIR_TURNS) for solver in ("surface", "full")]
 
 
@@ -126,6 +128,7 @@ def solve(cell: Cell, mesh: str | None = None) -> Outcome:
     from mpi4py import MPI
 
     from extrusion.condensed import Condensed, choose
+    from extrusion.guide import choose_guide
     from extrusion.mesh import case_mesh, read_mesh
     from extrusion.newton import Newton
     from extrusion.problem import Problem
@@ -142,7 +145,7 @@ def solve(cell: Cell, mesh: str | None = None) -> Outcome:
     clock.append(time.perf_counter())
     memory_factor, output, found, note = resident_memory("VmHWM"), 0.0, list[Step](), ""
     try:
-        for step in steps(system, newton, case.times()):
+        for step in steps(system, newton, case.times(), choose_guide(problem, system, cell.guide)):
             found.append(step)
             began = time.perf_counter()
             if step.t in PICTURED:

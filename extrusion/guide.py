@@ -3,8 +3,8 @@
 Newton's method converges quadratically, and an increment's own start is a millimetre or more away: it takes four to
 six linear solves. The same scene on a mesh some times coarser, in the meridian plane, is solved in a fraction of the
 time to a few hundredths of a millimetre; with contact linearised there, and with its contact set, the first solve ends
-so near that two more do. The answer is that of the fine model: it only starts elsewhere. Nested iteration:
-Kronsjö, Dahlquist, BIT 12 (1972) 63, doi:10.1007/BF01932674.
+so near that two more do, and no more as the mesh is refined. The answer is that of the fine model: it only starts
+elsewhere. Nested iteration; Deuflhard, Newton Methods for Nonlinear Problems (2011) 8, doi:10.1007/978-3-642-23899-4.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from extrusion.condensed import ITERATIONS, Condensed, seconds_an_iteration
 from extrusion.errors import InputError, StepError
 from extrusion.gap import Array, Index, Surface, shape
 from extrusion.gap3d import radial
-from extrusion.mesh import case_mesh, on_root
+from extrusion.mesh import bundled_path, case_mesh, on_root
 from extrusion.newton import Newton
 from extrusion.pairs import Pair
 from extrusion.problem import Problem
@@ -36,18 +36,20 @@ log = logging.getLogger(__name__)
 
 GUIDES = ("auto", "on", "off")
 
-COARSE = 1 / 12.5
-"""Element size of a guide, of the billet's radius: 4 mm in SSNV504; twice it, half, .. where `COARSER` asks."""
+SIZES = (0.16, 0.08, 0.04, 0.02)
+"""Element sizes of a guide, of the billet's radius: 8, 4, 2 and 1 mm in SSNV504, whose meshes are shipped.
 
-COARSER = (2.0, 8.0)
-"""How many times larger a guide's elements are than those it guides, at least (in the plane) and at most."""
+The first one serves where the second is too fine.
+"""
+
+LEAST, MOST = 2.0, 8.0
+"""How many times as large these are as the elements it guides: at least, in the plane; at most, if one is so fine."""
 
 ROUGHLY = 1e-4
 """Residual at which a guide's increment ends, of E times the radius squared: 1250 N in SSNV504, where 8e5 N press."""
 
-
-SAVED = 0.25
-"""Part of Newton's iterations that a guide saves: 0.2 to 0.45 were measured, and 0.1 to 0.25 in 3D."""
+SAVED = 0.3
+"""Part of Newton's iterations that a guide saves: 0.2 to 0.55 were measured, most on fine meshes, in 3D 0.1 to 0.25."""
 
 
 def choose_guide(problem: Problem, system: System, guide: str = "auto") -> Guide | None:
@@ -63,19 +65,19 @@ def choose_guide(problem: Problem, system: System, guide: str = "auto") -> Guide
     """
     if guide not in GUIDES:
         raise InputError("guide", guide, f"choose one of {', '.join(GUIDES)}")
-    case = problem.case
-    size = guide_size(problem)
-    if guide == "off":
+    case, size, why = problem.case, guide_size(problem), ""
+    if case.method == "nodal":
+        why = "nodal contact pairs its nodes anew"
+    elif all(zone.contact == "check" for zone in case.zones):
+        why = "contact is only checked"
+    elif size is None:
+        why = "there is no coarser mesh"
+    if guide == "on" and why:
+        raise InputError("guide", guide, f"{why}: leave it out")
+    if guide == "off" or why or size is None:
         return None
-    if case.method == "nodal" or size is None:
-        if guide == "on":
-            why = "nodal contact pairs its nodes anew" if case.method == "nodal" else "there is no coarser mesh"
-            raise InputError("guide", guide, f"{why}: leave it out")
-        return None
-    iterations = ITERATIONS * len(case.times())
-    each = COARSE * case.profile.radius / size
-    takes = 0.1 * each + 0.7 * iterations * (0.6e-3 + 0.7e-3 * each)
-    saves = SAVED * iterations * seconds_an_iteration(problem, system)
+    takes = _seconds(case, size)
+    saves = SAVED * ITERATIONS * len(case.times()) * seconds_an_iteration(problem, system)
     if guide == "auto" and saves < takes:
         return None
     try:
@@ -89,16 +91,21 @@ def choose_guide(problem: Problem, system: System, guide: str = "auto") -> Guide
     return made
 
 
+def _seconds(case: Case, size: float) -> float:
+    """What a guide takes, estimated at the rates of `extrusion.condensed.Cost`."""
+    fine = SIZES[1] * case.profile.radius / size
+    mesh = 1.0 if bundled_path(case.profile, size) is None else 0.0
+    return (mesh + 0.1) * fine + 3.5 * len(case.times()) * (0.6e-3 + 0.7e-3 * fine)
+
+
 def guide_size(problem: Problem) -> float | None:
     """Element size of a scene's guide, mm; None where that would be no mesh."""
-    case, profile = problem.case, problem.case.profile
-    fine = case.mesh_size if case.mesh is None else None  # that of a graded mesh is what its sizes are in proportion to
-    fine, size = fine or float(np.median(problem.terms[0].pair.lengths)), COARSE * profile.radius
-    while size > COARSER[1] * fine:
-        size /= 2
-    while problem.dim == 2 and size < COARSER[0] * (1 - 1e-6) * fine:
-        size *= 2
-    return size if size <= profile.length / 8 else None
+    fine = 1.1 * float(np.max(problem.terms[0].pair.lengths))  # sizes are divided into whole numbers of facets
+    coarsest, *sizes = (share * problem.case.profile.radius for share in SIZES)
+    size = next((size for size in sizes if size <= MOST * fine), sizes[-1])
+    if problem.dim == 3 or 1.2 * size >= LEAST * fine:
+        return size
+    return coarsest if 1.2 * coarsest >= LEAST * fine else None
 
 
 class Guide:

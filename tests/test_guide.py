@@ -266,22 +266,16 @@ def test_only_the_guided_model_speaks(caplog: pytest.LogCaptureFixture) -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "expected"), [(10.0, None), (4.0, 8.0), (2.0, 4.0), (1.0, 4.0), (0.4, 2.0), (0.1, 0.5)]
+    ("size", "in_plane", "in_space"),
+    [(10.0, None, 4.0), (3.87, 8.0, 4.0), (1.97, 4.0, 4.0), (0.498, 4.0, 4.0), (0.45, 2.0, 2.0), (0.01, 1.0, 1.0)],
 )
-def test_size(size: float, expected: float | None) -> None:
-    """Twice to eight times as large, and one that is shipped."""
+def test_size(size: float, in_plane: float | None, in_space: float) -> None:
+    """Two to eight times as large as the largest facet, and one that is shipped."""
     problem = scene(replace(A, size=4.0))
-    problem.case = replace(A, size=size)
-    assert guide_size(problem) == expected
-
-
-def test_size_for_a_mesh_that_is_given() -> None:
-    problem = scene(replace(A, size=None))  # 5 mm
-    problem.case = replace(problem.case, mesh="some.msh")
-    assert guide_size(problem) is None
-    problem.case = replace(problem.case, space="3d", order=1)
+    object.__setattr__(problem.terms[0].pair.slave, "length", np.array([0.1 * size, size]))
+    assert guide_size(problem) == in_plane
     problem.dim = 3
-    assert guide_size(problem) == 4.0  # in the plane it is cheap at any size
+    assert guide_size(problem) == in_space
 
 
 def test_case() -> None:
@@ -305,6 +299,9 @@ def test_chosen_where_it_saves(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found is not None
     assert found.size == 8.0
     assert choose_guide(problem, system, "off") is None
+    problem.case = problem.case.with_contact("check")
+    assert choose_guide(problem, system) is None
+    problem.case = A
 
     def no_gmsh(*of: Any) -> Any:
         raise InputError("size", 8.0, "needs gmsh")
@@ -320,6 +317,7 @@ def test_chosen_where_it_saves(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ({}, "maybe", "guide = 'maybe': choose one of auto, on, off"),
         ({"method": "nodal"}, "on", "guide = 'on': nodal contact pairs its nodes anew: leave it out"),
+        ({"contact": "check"}, "on", "guide = 'on': contact is only checked: leave it out"),
         ({"size": 10.0}, "on", "guide = 'on': there is no coarser mesh: leave it out"),
     ],
 )
