@@ -194,27 +194,28 @@ class Newton:
         Returns:
             How many linear solves it took.
         """
-        forecast = ahead if isinstance(ahead, Forecast) else None
-        if not self.predicts or not (forecast or self.problem.expect(ahead)):  # type: ignore[arg-type]
+        if not self.predicts or not (isinstance(ahead, Forecast) or self.problem.expect(ahead)):
             return 0
         y, trial, f, ksp = self._step, self._trial, self._trial_f, self.snes.getKSP()
         self.problem.residual(x, f)
         before = float(f.norm())
+        if isinstance(ahead, Forecast) and np.isnan(before):
+            before = np.inf  # where the surfaces have lost each other a forecast can still lead
         if not before > self.tolerance:  # there is nothing to predict, or nothing to be had of it
             self.problem.expect(None)
             return 0
-        if forecast:
-            at = self.problem.foresee(forecast, self.problem.gather(x))
+        if isinstance(ahead, Forecast):
+            at = self.problem.foresee(ahead, self.problem.gather(x))
             A = self.problem.linearised(x, f, at)
         else:
             A = self.problem.tangent(x, False)
-        solves = int(np.isfinite(float(f.norm())))
-        if solves:
+        known = np.isfinite(float(f.norm()))
+        if known:
             self.tangents += 1
             ksp.setOperators(A)
             ksp.solve(f, y)
         self.problem.expect(None)
-        if not solves:
+        if not known:
             return 0
         trial.waxpy(-1.0, y, x)
         self.problem.residual(trial, f)
@@ -222,7 +223,7 @@ class Newton:
             trial.copy(x)
             # with the contact set known it is nearer than its size says
             self._update = self.problem.largest_displacement(y) / 4
-            if forecast:
-                missed = self.problem.gather(x)[forecast.entries] - forecast.values
+            if isinstance(ahead, Forecast):
+                missed = self.problem.gather(x)[ahead.entries] - ahead.values
                 self._update = float(np.max(np.abs(missed), initial=0.0))
         return 1

@@ -130,7 +130,7 @@ def steps(
             problem.drive(x, goal)
             problem.forget_pattern()
             ahead: float | Forecast = dt / last if last else 1.0
-            if foreseen is not None and goal == target and not cuts:
+            if foreseen is not None and not cuts:
                 ahead = foreseen(target) or ahead
             outcome = _increment(problem, newton, accepted, ahead)
             iterations += outcome.iterations

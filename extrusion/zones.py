@@ -554,11 +554,10 @@ class IntegratedContact:
     def _stress(self, z: Array, points: Points, trial: Array) -> tuple[Array, Array]:
         """The contact stress, and its derivative by the trial stress."""
         held = self.closed[points.facet][:, None]
-        if self._expected.on:
-            return self._expected.law(
-                trial, self.pair.along(z, points), held if self.pair.closure == "bilateral" else None
-            )
-        return project(trial, self.pair.closure, held)
+        if not self._expected.on:
+            return project(trial, self.pair.closure, held)
+        along = self.pair.along(z, points)
+        return self._expected.law(trial, along, held if self.pair.closure == "bilateral" else None)
 
     def add_residual(self, z: Array, R: Array) -> None:
         if self.pair.closure == "check" or (not self._theta and self._is_far(z)):

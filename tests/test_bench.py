@@ -57,6 +57,8 @@ def test_cells() -> None:
     pairs = [cell for cell in cells if cell.part == "pairs"]
     assert [cell.solver for cell in pairs] == ["surface", "full"] * (len(pairs) // 2)
     assert all(pairs[i] == replace(pairs[i + 1], solver="surface") for i in range(0, len(pairs), 2))
+    assert {cell.guide for cell in pairs} == {"off"}
+    assert {cell.guide for cell in cells if cell.part != "pairs"} == {"auto"}
     assert {cell.size for cell in QUICK} <= {None, 4.0, 2.0, 1.0}
 
 
@@ -76,6 +78,8 @@ def test_a_run_in_its_own_process() -> None:
     assert 0.1 < outcome.compliance < 2  # MB
     full = bench.measure(replace(CELL, solver="full", until=20.0))
     assert (full.condensation, full.compliance) == (0.0, 0.0)
+    plain, guided = (bench.measure(replace(CELL, guide=guide, until=20.0)) for guide in ("off", "on"))
+    assert guided.iterations < plain.iterations
     assert math.isnan(full.pressure_error)
 
 

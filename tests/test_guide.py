@@ -64,10 +64,17 @@ def test_the_same_answer_sooner(changes: dict[str, Any], most: float) -> None:
 def test_a_zone_that_is_held(method: str) -> None:
     """Glissière: points that are held stay so, wherever the guide's contact ends."""
     problem = scene(changed(cases.C, method=method, order=2, size=2.0, increment=5.0, until=60.0, figures=()))
-    plain, guided = taken(Condensed(problem)), taken(Condensed(problem), Guide(problem, 4.0))
+    plain, system = taken(Condensed(problem)), Condensed(problem)
+    guided = taken(system, Guide(problem, 4.0))
     for one, other in zip(plain, guided, strict=True):
         assert other.points["K"] == pytest.approx(one.points["K"], abs=1e-7)
     assert sum(step.iterations for step in guided) <= 0.85 * sum(step.iterations for step in plain)
+    z = system.gather(system.x)
+    forces = system.contact_forces(z)
+    assert np.abs(forces).max() > 1e4
+    for term in system.terms:
+        term.follow(ContactSet(False, np.zeros(0)))
+    assert_allclose(system.contact_forces(z), forces, rtol=0, atol=1e-6)
 
 
 def test_most_steps_take_one_or_two_iterations() -> None:
@@ -225,6 +232,68 @@ def test_a_forecast_that_is_wrong(surface: bool, far: float) -> None:
     found = taken(system, wrong)
     assert [step.t for step in found] == [step.t for step in plain]
     assert found[-1].reaction == pytest.approx(plain[-1].reaction, abs=1e-3)
+
+
+def test_a_forecast_that_is_no_number() -> None:
+    """It is as if nothing were predicted."""
+    problem = scene(changed(A, size=4.0, until=20.0))
+    for system in (Condensed(problem), problem):
+        times = A.times()[:4]
+        alone = list(steps(system, Newton(system, predicts=False), times))
+        entries = Guide(problem, 8.0)(5.0).entries
+        none = Forecast(entries, np.full(len(entries), np.nan), 2 * [ContactSet(True, np.zeros(0))])
+        found = list(steps(system, Newton(system), times, lambda t, none=none: none))
+        assert [step.iterations for step in found] == [step.iterations for step in alone]
+        assert [step.tangents for step in found] == [step.tangents for step in alone]
+
+
+def test_one_try_for_each_increment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a forecast has led nowhere the increment is cut, and goes on without."""
+    problem = scene(changed(A, size=4.0, until=15.0))
+    system, asked = Condensed(problem), []
+    newton = Newton(system)
+    solve = newton.solve
+
+    def stuck(x: Any, at_most: int | None = None, ahead: Any = 1.0, share: float = 0.0) -> Any:
+        done = solve(x, at_most, ahead, share)
+        return replace(done, converged=False, reason="led astray") if isinstance(ahead, Forecast) else done
+
+    monkeypatch.setattr(newton, "solve", stuck)
+    true = Guide(problem, 8.0)
+    found = list(steps(system, newton, problem.case.times(), lambda t: asked.append(t) or true(t)))
+    assert asked == [5.0, 10.0, 15.0]
+    assert [step.cuts for step in found] == [1, 1, 1]
+
+
+def test_how_near_it_was_is_known() -> None:
+    """The second variation of the gap is taken at once where the predicted solve ends near what was foreseen."""
+    problem = scene(replace(A, size=1.0).with_increment(20.0, 20.0))
+    system = Condensed(problem)
+    newton, forecast = Newton(system), Guide(problem, 2.0)(20.0)
+    *_, _last = steps(system, newton, [15.0])
+    system.shift_billet(system.x, 5.0)
+    newton._begin()
+    newton.tolerance = 1e-3
+    assert newton._predict(system.x, forecast) == 1
+    missed = np.abs(system.gather(system.x)[forecast.entries] - forecast.values).max()
+    assert newton._update == pytest.approx(missed)
+    assert missed < newton._near
+
+
+def test_from_where_surfaces_have_lost_each_other() -> None:
+    """The residual of such a start is no number; with a forecast it does not matter."""
+    problem = scene(changed(A, size=4.0, increment=20.0, until=20.0))
+    forecast = Guide(problem, 8.0)(20.0)
+    for system, astray in ((Condensed(problem), 1e9), (problem, 1e3)):
+        newton = Newton(system)
+        *_, _last = steps(system, newton, [20.0])
+        x, found = system.x, system.x.copy()
+        for ahead in (1.0, forecast):
+            x.array[1:] = astray * np.cos(np.arange(x.size - 1))
+            system.drive(x, 20.0)
+            assert newton.solve(x, ahead=ahead).converged is (ahead is forecast)
+        x.axpy(-1.0, found)
+        assert x.norm() < 1e-6 * found.norm()
 
 
 def test_a_guide_that_stops(monkeypatch: pytest.MonkeyPatch) -> None:
