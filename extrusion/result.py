@@ -426,13 +426,17 @@ def run(
     painter = Painter(comm.size) if out is not None and pictures and comm.rank == 0 else None
     problem = Problem(case, _mesh(comm, case, plain), comm)
     seconds = {"setup": time.perf_counter() - start, "solve": 0.0, "output": 0.0}
+    began = time.perf_counter()
+    guided = choose_guide(problem, problem, guide) if guide == "on" else None  # or refused, before anything is written
+    seconds["solve"] += time.perf_counter() - began
     camera = output.Camera(case, PICTURED)
     folder = None if out is None else output.Folder(out, comm, painter)
     watching = [camera, *(() if folder is None else folder.observers), *observers]
     began = time.perf_counter()
     system = choose(problem, solver)
     newton = Newton(system)
-    guided = choose_guide(problem, system, guide)
+    if guide == "auto":
+        guided = choose_guide(problem, system)
     seconds["solve"] += time.perf_counter() - began
 
     accepted: list[Step] = []

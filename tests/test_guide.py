@@ -175,6 +175,7 @@ def test_displacements_are_carried_over() -> None:
             z[2 * surface.nodes[..., None] + np.arange(2)] = field(surface.X)
     found = np.full(problem.n_z, np.nan)
     found[ahead._entries] = np.concatenate([link(z) for link in ahead._links])
+    assert problem.z_free[ahead._entries].all()
     for term in problem.terms:
         for surface in (term.pair.slave, term.pair.die):
             entries = 2 * surface.nodes[..., None] + np.arange(2)
@@ -381,6 +382,13 @@ def test_chosen_where_it_saves(monkeypatch: pytest.MonkeyPatch) -> None:
         choose_guide(problem, system, "on")
 
 
+def test_a_mesh_that_is_not_shipped_takes_longer() -> None:
+    other = replace(A, profile=replace(A.profile, radius=49.0))
+    for size in (4.0, 2.0):
+        assert guide._seconds(other, size) > guide._seconds(A, size) + 0.5
+    assert guide._seconds(A.with_increment(1.0), 4.0) > guide._seconds(A, 4.0)
+
+
 @pytest.mark.parametrize(
     ("changes", "choice", "message"),
     [
@@ -390,10 +398,11 @@ def test_chosen_where_it_saves(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"size": 10.0}, "on", "guide = 'on': there is no coarser mesh: leave it out"),
     ],
 )
-def test_refused(changes: dict[str, Any], choice: str, message: str) -> None:
+def test_refused(changes: dict[str, Any], choice: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as told:
-        run(A, until=5.0, guide=choice, **changes)
+        run(A, until=5.0, guide=choice, out=tmp_path / "a", **changes)
     assert str(told.value) == message
+    assert not (tmp_path / "a").exists()
 
 
 def test_from_the_command_line(tmp_path: Path) -> None:
@@ -405,4 +414,6 @@ def test_from_the_command_line(tmp_path: Path) -> None:
     assert data["guide"] == 8.0
     assert data["seconds"]["guide"] > 0
     assert json.loads((tmp_path / "a" / "run.json").read_text())["options"]["guide"] == "on"
-    assert json.loads(CliRunner().invoke(app, args).stdout)["guide"] is None
+    plain = json.loads(CliRunner().invoke(app, args).stdout)
+    assert plain["guide"] is None
+    assert sum(s["iterations"] for s in data["steps"]) < sum(s["iterations"] for s in plain["steps"])
