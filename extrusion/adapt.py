@@ -271,7 +271,7 @@ def _graded(at: Array, h: Array, growth: float) -> Callable[[float, float], floa
     return size
 
 
-def estimated(case: Case, mesh: PlainMesh, goal: Goal) -> tuple[Error, Array, float]:
+def estimated(case: Case, mesh: PlainMesh, goal: Goal, guide: str = "auto") -> tuple[Error, Array, float]:
     """A run on a mesh, on one rank: its estimated error, and what `refined` asks.
 
     Returns:
@@ -286,7 +286,7 @@ def estimated(case: Case, mesh: PlainMesh, goal: Goal) -> tuple[Error, Array, fl
     every = math.ceil(len(times) / STATIONS)
     done: list[Step] = []
     found: list[tuple[Step, dict[Goal, Array]]] = []
-    for step in steps(system, Newton(system), times, choose_guide(problem, system)):
+    for step in steps(system, Newton(system), times, choose_guide(problem, system, guide)):
         done.append(step)
         if (len(times) - len(done)) % every == 0:
             found.append((step, indicators(problem, step.x, GOALS, recovery)))
@@ -300,7 +300,12 @@ def estimated(case: Case, mesh: PlainMesh, goal: Goal) -> tuple[Error, Array, fl
 
 
 def adapt(
-    case: Case, tolerance: float, goal: Goal, comm: MPI.Intracomm, start: PlainMesh | None = None
+    case: Case,
+    tolerance: float,
+    goal: Goal,
+    comm: MPI.Intracomm,
+    start: PlainMesh | None = None,
+    guide: str = "auto",
 ) -> tuple[PlainMesh | None, Estimate]:
     """A mesh that is refined until the estimated error is below a tolerance. Collective; rank 0 works.
 
@@ -310,6 +315,7 @@ def adapt(
         goal: "K" or "reaction".
         comm: Ranks that wait for it.
         start: Mesh to begin with, on rank 0; by default a coarse graded one.
+        guide: As `run` has it.
 
     Returns:
         The mesh on rank 0 (None elsewhere), and its estimate.
@@ -329,7 +335,7 @@ def adapt(
         mesh, parts = start or graded_mesh(case.profile, COARSEST * case.profile.radius), []
         for number in range(MESHES):
             try:
-                error, eta, scale = estimated(scene, mesh, goal)
+                error, eta, scale = estimated(scene, mesh, goal, guide)
             except StepError as failed:
                 return str(failed)
             taken = error.of(goal) <= tolerance

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 
@@ -29,7 +30,7 @@ from extrusion.newton import Newton
 from extrusion.pairs import Pair
 from extrusion.problem import Problem
 from extrusion.result import changed
-from extrusion.stepping import steps
+from extrusion.stepping import Step, steps
 from extrusion.system import Forecast, System, node_positions
 
 log = logging.getLogger(__name__)
@@ -46,7 +47,10 @@ LEAST, MOST = 2.0, 8.0
 """How many times as large these are as the elements it guides: at least, in the plane; at most, if one is so fine."""
 
 ROUGHLY = 1e-4
-"""Residual at which a guide's increment ends, of E times the radius squared: 1250 N in SSNV504, where 8e5 N press."""
+"""Residual at which a guide's increment ends, of E times the radius squared: 1250 N in SSNV504, where 8e5 N press.
+
+In plane strain, where forces are those of 1 mm of thickness, of E times the radius.
+"""
 
 SAVED = 0.3
 """Part of Newton's iterations that a guide saves: 0.2 to 0.55 were measured, most on fine meshes, in 3D 0.1 to 0.25."""
@@ -82,9 +86,10 @@ def choose_guide(problem: Problem, system: System, guide: str = "auto") -> Guide
         return None
     try:
         made = Guide(problem, size)
-    except InputError:  # no gmsh for its mesh
+    except InputError as error:  # no gmsh for its mesh
         if guide == "on":
-            raise
+            remedy = f"it has no mesh of {size:g} mm ({error.remedy}): leave it out"
+            raise InputError("guide", guide, remedy) from None
         return None
     if problem.comm.rank == 0:
         log.info("guided by P2 triangles of %g mm: estimated to take %.2g s and to save %.2g s", size, takes, saves)
@@ -100,12 +105,16 @@ def _seconds(case: Case, size: float) -> float:
 
 def guide_size(problem: Problem) -> float | None:
     """Element size of a scene's guide, mm; None where that would be no mesh."""
-    fine = 1.1 * float(np.max(problem.terms[0].pair.lengths))  # sizes are divided into whole numbers of facets
-    coarsest, *sizes = (share * problem.case.profile.radius for share in SIZES)
-    size = next((size for size in sizes if size <= MOST * fine), sizes[-1])
-    if problem.dim == 3 or 1.2 * size >= LEAST * fine:
-        return size
-    return coarsest if 1.2 * coarsest >= LEAST * fine else None
+    zone, pair, profile = problem.case.zones[0], problem.terms[0].pair, problem.case.profile
+    billet = pair.slave if zone.slave == "billet" else pair.die
+    fine = 1.1 * float(np.max(billet.length))  # sizes are divided into whole numbers of facets
+    coarsest, *sizes = (share * profile.radius for share in SIZES)
+    size = next((size for size in sizes if size <= min(MOST * fine, profile.length / 2)), sizes[-1])
+    if problem.dim == 2 and 1.2 * size < LEAST * fine:
+        size = coarsest
+        if 1.2 * size < LEAST * fine:
+            return None
+    return size if size <= profile.length / 2 else None
 
 
 class Guide:
@@ -154,17 +163,20 @@ class _Ahead:
         free = [problem.z_free[link.entries] for link in links]
         self._links = [link.only(of) for link, of in zip(links, free, strict=True)]
         self._entries = np.concatenate([link.entries for link in self._links])
-        newton = Newton(self._system, atol=ROUGHLY * case.billet.E * case.profile.radius**2)
-        self._steps = steps(self._system, newton, case.times())
+        dims = 1 if case.space == "plane strain" else 2
+        newton = Newton(self._system, atol=ROUGHLY * case.billet.E * case.profile.radius**dims)
+        self._steps: Iterator[Step] = steps(self._system, newton, case.times())
 
     def at(self, t: float) -> Forecast | None:
         """The forecast for t, mm."""
         try:
             step = next((step for step in self._steps if step.t >= t), None)
-        except StepError:  # no further
+        except (StepError, ArithmeticError, PETSc.Error):  # the run can do without
             return None
         if step is None or step.t != t:
             return None
+        if step.cuts:  # what is hard for it would take longer than it saves
+            self._steps = iter(())
         z = self._system.gather(self._system.x)
         values = np.concatenate([link(z) for link in self._links])
         return Forecast(self._entries, values, [term.contact_set(z) for term in self._system.terms])

@@ -189,7 +189,7 @@ class Newton:
         """One linear solve with the contact set that is expected: it hardly moves in the die as the billet slides by.
 
         Newton's method would find the ends of the contact by steps of a few facets. With a forecast, contact is
-        linearised at its displacements. Kept unless the residual triples.
+        linearised at its displacements; where that cannot be, it is as without. Kept unless the residual triples.
 
         Returns:
             How many linear solves it took.
@@ -216,7 +216,7 @@ class Newton:
             ksp.solve(f, y)
         self.problem.expect(None)
         if not known:
-            return 0
+            return self._predict(x, ahead.ahead) if isinstance(ahead, Forecast) else 0
         trial.waxpy(-1.0, y, x)
         self.problem.residual(trial, f)
         if float(f.norm()) < 3 * max(before, self.tolerance):  # the norm says little

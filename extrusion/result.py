@@ -354,7 +354,8 @@ def run(
             same answer, where there is but one.
         guide: "on": a coarser model in the meridian plane goes ahead, and each increment starts from where its own
             ends, so that Newton's method takes fewer iterations (`extrusion.guide`); "off"; or "auto": where it is
-            estimated to save more than it takes. The answer is the fine model's, to its tolerance.
+            estimated to save more than it takes. The answer is the fine model's, to its tolerance, where there is but
+            one.
         tolerance: Relative error of the goal for which the cheapest model is chosen (die, order, size, zones), in place
             of the case's own; the result has the `Estimate`.
         goal: "K" (its u_y) or "reaction".
@@ -410,26 +411,28 @@ def run(
     if adapt and tolerance is None:
         raise InputError("adapt", adapt, "give a tolerance too: the mesh is refined until the goal has it")
     if tolerance is not None:
-        for name, value in {**{name: changes.get(name) for name in CHOSEN}, "mesh": mesh}.items():
+        given_beside = {name: changes.get(name) for name in CHOSEN} | {"mesh": mesh}
+        given_beside["guide"] = "on" if guide == "on" else None  # which that model may be too coarse for
+        for name, value in given_beside.items():
             if value is not None:
                 raise InputError(name, value, "leave it out: with a tolerance the model is chosen")
         if adapt:
             from extrusion.adapt import adapt as adapted
             from extrusion.estimate import continuous
 
-            plain, estimate = adapted(case, tolerance, goal, comm)
+            plain, estimate = adapted(case, tolerance, goal, comm, guide=guide)
             case = continuous(case)
         else:
             from extrusion.estimate import choose_model
 
             case, estimate = choose_model(case, tolerance, goal, comm)
-    painter = Painter(comm.size) if out is not None and pictures and comm.rank == 0 else None
     problem = Problem(case, _mesh(comm, case, plain), comm)
     seconds = {"setup": time.perf_counter() - start, "solve": 0.0, "output": 0.0}
     began = time.perf_counter()
     guided = choose_guide(problem, problem, guide) if guide == "on" else None  # or refused, before anything is written
     seconds["solve"] += time.perf_counter() - began
     camera = output.Camera(case, PICTURED)
+    painter = Painter(comm.size) if out is not None and pictures and comm.rank == 0 else None
     folder = None if out is None else output.Folder(out, comm, painter)
     watching = [camera, *(() if folder is None else folder.observers), *observers]
     began = time.perf_counter()
@@ -564,7 +567,12 @@ def verify(case: Case, **options: Any) -> list[Result]:
     refuse_unverifiable(case, **options)
     asked = {figure.contact for figure in case.figures}
     variants = {"solved": case, "check": case.with_contact("check")}
-    return [run(variant, **options) for contact, variant in variants.items() if contact in asked]
+    plain = options | {"guide": "off"}  # nothing to be guided where contact is only checked
+    return [
+        run(variant, **(plain if contact == "check" else options))
+        for contact, variant in variants.items()
+        if contact in asked
+    ]
 
 
 def refuse_unverifiable(case: Case, **options: Any) -> None:

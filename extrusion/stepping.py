@@ -126,14 +126,17 @@ def steps(
             goal = target if t + 1.001 * dt >= target else t + dt
             dt = goal - t
             x.copy(accepted)
-            x.axpy(dt, rate)
-            problem.drive(x, goal)
-            problem.forget_pattern()
-            ahead: float | Forecast = dt / last if last else 1.0
-            if foreseen is not None and not cuts:
-                ahead = foreseen(target) or ahead
-            outcome = _increment(problem, newton, accepted, ahead)
-            iterations += outcome.iterations
+            ahead = dt / last if last else 1.0
+            forecast = foreseen(target) if foreseen is not None and not cuts else None
+            for start in (ahead,) if forecast is None else (replace(forecast, ahead=ahead), ahead):
+                accepted.copy(x)
+                x.axpy(dt, rate)
+                problem.drive(x, goal)
+                problem.forget_pattern()
+                outcome = _increment(problem, newton, accepted, start)
+                iterations += outcome.iterations
+                if outcome.converged:
+                    break
             if outcome.converged:
                 try:
                     states = problem.accept(x)

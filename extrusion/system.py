@@ -28,6 +28,7 @@ class Forecast:
     entries: Index  # of the contact vector, displacements
     values: Array  # these, mm
     closed: list[ContactSet]  # of each zone
+    ahead: float = 1.0  # the increment over the last one, if it cannot be had
 
 
 class System(ABC):
