@@ -426,13 +426,13 @@ def run(
             from extrusion.estimate import choose_model
 
             case, estimate = choose_model(case, tolerance, goal, comm)
+    painter = Painter(comm.size) if out is not None and pictures and comm.rank == 0 else None
     problem = Problem(case, _mesh(comm, case, plain), comm)
     seconds = {"setup": time.perf_counter() - start, "solve": 0.0, "output": 0.0}
     began = time.perf_counter()
     guided = choose_guide(problem, problem, guide) if guide == "on" else None  # or refused, before anything is written
     seconds["solve"] += time.perf_counter() - began
     camera = output.Camera(case, PICTURED)
-    painter = Painter(comm.size) if out is not None and pictures and comm.rank == 0 else None
     folder = None if out is None else output.Folder(out, comm, painter)
     watching = [camera, *(() if folder is None else folder.observers), *observers]
     began = time.perf_counter()
