@@ -29,7 +29,6 @@ from extrusion.mesh import bundled_path, case_mesh, on_root
 from extrusion.newton import Newton
 from extrusion.pairs import Pair
 from extrusion.problem import Problem
-from extrusion.result import changed
 from extrusion.stepping import Step, steps
 from extrusion.system import Forecast, System, node_positions
 
@@ -234,5 +233,7 @@ def _nearest(curve: Surface, x: Array) -> tuple[Index, Array]:
 def guiding(case: Case, size: float) -> Case:
     """The scene of a guide: in the meridian plane, P2 elements, Nitsche's method as it is by default."""
     space = "axisymmetric" if case.space == "3d" else case.space
-    case = changed(case, space=space, size=size, off_symmetry=0.0)
-    return replace(case, method="nitsche", order=2, gamma=None, theta=0, form=None)
+    return replace(
+        case, space=space, size=size, mesh=None, sectors=None, element="lagrange", off_symmetry=0.0,
+        method="nitsche", order=2, gamma=None, theta=0, form=None,
+    )  # fmt: skip
