@@ -3,8 +3,8 @@
 Newton's method converges quadratically, and an increment's own start is a millimetre or more away: it takes four to
 six linear solves. The same scene on a mesh some times coarser, in the meridian plane, is solved in a fraction of the
 time to a few hundredths of a millimetre; with contact linearised there, and with its contact set, the first solve ends
-so near that two more do, and no more as the mesh is refined. The answer is that of the fine model: it only starts
-elsewhere. Nested iteration; Deuflhard, Newton Methods for Nonlinear Problems (2011) 8, doi:10.1007/978-3-642-23899-4.
+so near that two or three more do, and hardly more as the mesh is refined. The answer is that of the fine model: it only
+starts elsewhere. Nested iteration; Deuflhard, Newton Methods for Nonlinear Problems (2011) 8, doi:10.1007/978-3-642-23899-4.
 """
 
 from __future__ import annotations
@@ -91,7 +91,8 @@ def choose_guide(problem: Problem, system: System, guide: str = "auto") -> Guide
             raise InputError("guide", guide, remedy) from None
         return None
     if problem.comm.rank == 0:
-        log.info("guided by P2 triangles of %g mm: estimated to take %.2g s and to save %.2g s", size, takes, saves)
+        why = f": estimated to take {takes:.2g} s and to save {saves:.2g} s" if guide == "auto" else ""
+        log.info("guided by P2 triangles of %g mm%s", size, why)
     return made
 
 

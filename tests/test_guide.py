@@ -220,7 +220,7 @@ def test_what_it_foresees_is_near() -> None:
 @pytest.mark.parametrize("surface", [True, False])
 @pytest.mark.parametrize("far", [5.0, 1e6, np.nan])
 def test_a_forecast_that_is_wrong(surface: bool, far: float) -> None:
-    """It is dropped, or the step is cut and goes on without: the answer is the same."""
+    """It is dropped, or the increment is solved again without: the answer is the same."""
     problem = scene(changed(A, size=4.0, until=20.0))
     system: System = Condensed(problem) if surface else problem
     true, plain = Guide(problem, 8.0), taken(system)
