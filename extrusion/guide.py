@@ -4,7 +4,8 @@ Newton's method converges quadratically, and an increment's own start is a milli
 six linear solves. The same scene on a mesh some times coarser, in the meridian plane, is solved in a fraction of the
 time to a few hundredths of a millimetre; with contact linearised there, and with its contact set, the first solve ends
 so near that two or three more do, and hardly more as the mesh is refined. The answer is that of the fine model: it only
-starts elsewhere. Nested iteration; Deuflhard, Newton Methods for Nonlinear Problems (2011) 8, doi:10.1007/978-3-642-23899-4.
+starts elsewhere. Nested iteration; Deuflhard, Newton Methods for Nonlinear Problems (2011) 8,
+doi:10.1007/978-3-642-23899-4.
 """
 
 from __future__ import annotations
